@@ -111,7 +111,7 @@ def test_a_film_on_a_disk_that_gets_full_can_be_played_up_to_there(tmp_path, suf
     whole, path = tmp_path / f"whole{suffix}", tmp_path / f"a{suffix}"
     noisy_film(whole, 6)
     size = whole.stat().st_size
-    for part, least, most in ((0.6, 50, 100), (1 - 5e-3, 125, 150)):  # on the way, and when it is completed
+    for part, least, most in ((0.6, 50, 100), (1 - 1e-3, 125, 150)):  # on the way, and when it is completed
         with full_disk(int(part * size)), pytest.raises(CotargetError, match=rf"a{suffix}: .*{SAID}") as caught:
             noisy_film(path, 6)
         said = [str(caught.value), *getattr(caught.value, "__notes__", ())]
