@@ -17,7 +17,7 @@ from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
 from cotarget.tracking.track import Track
-from tests.rigs import with_zoom_head
+from tests.support.rigs import with_zoom_head
 
 pytestmark = pytest.mark.render
 EXACT_DEG = 1e-6  # the inverse is exact to 1e-9; the rays of both lens models agree to 1e-12

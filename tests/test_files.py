@@ -14,7 +14,7 @@ from cotarget.drawing import write_picture
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile, PartFile, write_atomically
 from cotarget.video import Film, FilmWriter
-from tests.full_disk import SAID, full_disk
+from tests.support.full_disk import SAID, full_disk
 
 ROOT = Path(__file__).parents[1]
 IMAGE = np.full((48, 64, 3), 90, np.uint8)

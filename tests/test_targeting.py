@@ -25,7 +25,7 @@ from cotarget.targeting import (
     target_implausibility,
 )
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
-from tests.rigs import with_zoom_head
+from tests.support.rigs import with_zoom_head
 
 # The solver accepts a miss of 1e-11 rad, which is 1e-7 px at the longest focal length of 8000 px.
 PIXEL = 1e-6

@@ -10,7 +10,7 @@ from cotarget.cli.main import main
 from cotarget.errors import ConfigError
 from cotarget.metrics import Label, Tracked, read_labels, read_tracks, score_tracks
 from cotarget.video import FilmWriter
-from tests.recorded_run import RATE_HZ, Bright, calibration_file, record
+from tests.support.recorded_run import RATE_HZ, Bright, calibration_file, record
 
 RATE = 25.0
 FRAMES = 100
@@ -164,7 +164,7 @@ def test_the_command_scores_a_film(tmp_path, capsys):
 
 
 def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):
-    """The bright bird of `tests.recorded_run`, labelled where it is drawn, by the numbers of the recorded pictures."""
+    """The bright bird of `tests.support.recorded_run`, labelled where it is drawn; scored by the recorded pictures."""
     monkeypatch.setattr("cotarget.detection.make_detector", lambda *_: Bright())
     steps = record(tmp_path / "run", calibration_file(tmp_path), seconds=1.6)
     rows = []

@@ -10,7 +10,7 @@ from cotarget.board import print_board
 from cotarget.calibration.corners import find_corners
 from cotarget.config import BoardConfig
 from cotarget.errors import ConfigError
-from tests.full_disk import SAID, full_disk
+from tests.support.full_disk import SAID, full_disk
 
 BOARD = BoardConfig(corners=(7, 4), square=0.02)
 PIXELS_PER_SQUARE = 0.02 / 0.0254 * 300

@@ -12,7 +12,7 @@ from cotarget.config import BoardConfig
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, Rotation
 from experiments.calibration.synthetic.rig import Truth
-from tests.synthetic_rig import draw, pixel_rays
+from tests.support.synthetic_rig import draw, pixel_rays
 
 BOARD = BoardConfig()
 PHOTOS = Path(__file__).parents[3] / "shared" / "data" / "opencv_stereo"

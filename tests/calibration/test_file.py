@@ -22,7 +22,7 @@ from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig_geometry import FixedCamera, ZoomHead
-from tests.rigs import with_zoom_head
+from tests.support.rigs import with_zoom_head
 
 ROUNDING = 1e-15  # between radians and degrees, matrix and rotation vector
 

@@ -9,7 +9,7 @@ import pytest
 from cotarget.calibration.session import with_stills
 from cotarget.errors import StaleFrameError
 from cotarget.rig import Frame, ZoomState
-from tests.rigs import rig_of
+from tests.support.rigs import rig_of
 
 FACTOR = 10.2  # 3264 over 320: the PowerShot S5 IS
 EXPOSED_AFTER = 0.3  # from asking for a still to its exposure [s]

@@ -15,7 +15,7 @@ from cotarget.calibration.uncertainty import cross_validate, model_of
 from cotarget.config import BoardConfig
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZES, Lens, Truth, other_rig, truth_of
 from experiments.calibration.synthetic.views import Placing, noisy, placed, spread_views, views_at_stops, zoom_view
-from tests.synthetic_rig import fourfold
+from tests.support.synthetic_rig import fourfold
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

@@ -17,7 +17,7 @@ from cotarget.pantilt import HeadGeometry
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth, other_rig
 from experiments.calibration.synthetic.views import synthetic_views
-from tests.rigs import with_zoom_head
+from tests.support.rigs import with_zoom_head
 
 SPEC = describe(RigConfig(sim=SimConfig()))
 NOISE_PX = 0.1

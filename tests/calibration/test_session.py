@@ -19,7 +19,7 @@ from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import SIZE, Truth
-from tests.synthetic_rig import SyntheticRig
+from tests.support.synthetic_rig import SyntheticRig
 
 BOARD = BoardConfig()
 

@@ -32,7 +32,7 @@ from experiments.calibration.honesty import GROUPS, error_of, inside
 from experiments.calibration.synthetic.aims import draw_targets, pointing_errors
 from experiments.calibration.synthetic.rig import SIZE, Truth, other_rig
 from experiments.calibration.synthetic.views import synthetic_views
-from tests.rigs import with_zoom_head
+from tests.support.rigs import with_zoom_head
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

@@ -15,8 +15,8 @@ from cotarget.config import BoardConfig
 from cotarget.geometry import RigidTransform
 from experiments.calibration.synthetic.aims import draw_targets, misses
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth, undistorted
-from tests.rigs import with_zoom_head
-from tests.synthetic_rig import FOURFOLD, SyntheticRig, fourfold, zoomed
+from tests.support.rigs import with_zoom_head
+from tests.support.synthetic_rig import FOURFOLD, SyntheticRig, fourfold, zoomed
 
 BOARD = BoardConfig()
 QUICK = Options(folds=0)

@@ -20,8 +20,8 @@ from cotarget.geometry import RigidTransform, pose
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from experiments.calibration.synthetic.rig import NOMINAL_PX, Truth, undistorted
-from tests.rigs import with_zoom_head
-from tests.synthetic_rig import draw, fourfold, pixel_rays, zoomed
+from tests.support.rigs import with_zoom_head
+from tests.support.synthetic_rig import draw, fourfold, pixel_rays, zoomed
 
 OLD = "what was there before\n"
 PIXEL = 1e-5  # an angle of 1e-11 rad, printed in full, at 692 px; and a text's rounding

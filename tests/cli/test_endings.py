@@ -19,8 +19,8 @@ from cotarget.errors import DeviceError
 from cotarget.pipeline import State, follow
 from cotarget.video import Film, FilmWriter
 from tests.cli.test_commands import OLD, call
-from tests.recorded_run import Bright, ToyDevices, calibration_file, record, toy_rig
-from tests.rigs import rig_of
+from tests.support.recorded_run import Bright, ToyDevices, calibration_file, record, toy_rig
+from tests.support.rigs import rig_of
 from tests.test_drawing import step
 
 FOLLOW = ("follow", "--rig", "rig.toml", "--calibration", "rig_calibration.json", "--target", "bird",

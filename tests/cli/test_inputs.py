@@ -10,7 +10,7 @@ from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
 from cotarget.files import PartFile
 from tests.cli.test_commands import OLD, call, draw_photo, true_calibration, write_index
-from tests.recorded_run import calibration_file, record, toy_rig
+from tests.support.recorded_run import calibration_file, record, toy_rig
 from tests.test_video import bird_film
 
 RIG = """

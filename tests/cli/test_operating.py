@@ -23,8 +23,8 @@ from cotarget.errors import EmergencyStopError
 from cotarget.latency import Delay, HeadLatency
 from cotarget.safety.stop_file import refuse_if_stopped
 from tests.cli.test_commands import call, true_calibration
-from tests.rigs import rig_of
-from tests.safety_rigs import SimulatedDevices
+from tests.support.rigs import rig_of
+from tests.support.safety_rigs import SimulatedDevices
 
 NOBODY = "/dev/nobody-is-here"
 HARDWARE = f"""

@@ -18,8 +18,8 @@ from cotarget.config import RigConfig
 from cotarget.errors import CalibrationError, DeviceError
 from cotarget.rig import Frame, ZoomState
 from tests.cli.test_commands import OLD, call, true_calibration
-from tests.rigs import rig_of
-from tests.safety_rigs import SimulatedDevices
+from tests.support.rigs import rig_of
+from tests.support.safety_rigs import SimulatedDevices
 
 
 @pytest.fixture

@@ -15,14 +15,14 @@ import pytest
 from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
 from tests.cli.test_commands import true_calibration
-from tests.safety_rigs import DEADLINE_S
+from tests.support.safety_rigs import DEADLINE_S
 
 # A program with a rig in real time that says what its devices are told; a halt waits for a line on stdin.
 PROGRAM = """
 import sys, time
-from tests.safety_rigs import RealDevices
+from tests.support.safety_rigs import RealDevices
 from cotarget.config import SafetyConfig
-from tests.rigs import guarded
+from tests.support.rigs import guarded
 
 def say(word):
     print(word, flush=True)

@@ -20,7 +20,7 @@ from cotarget.rig import PanTiltLimits, PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.motion import Axis
 from cotarget.targeting import WantedSize
-from tests.rigs import rig_of
+from tests.support.rigs import rig_of
 
 SIZE, CENTER = (640, 480), (319.5, 239.5)
 SHORTEST, LONGEST = 700.0, 7000.0

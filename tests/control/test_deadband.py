@@ -13,7 +13,7 @@ from cotarget.rig import PanTiltLimits, PanTiltState
 from cotarget.sim.motion import Axis
 from cotarget.targeting import Reach, aim
 from experiments.calibration.synthetic.rig import SIZE
-from tests.moving_targets import RATE, Flight, show
+from tests.support.moving_targets import RATE, Flight, show
 
 STEP = math.radians(0.0514286)
 LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), STEP)

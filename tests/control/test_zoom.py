@@ -9,7 +9,7 @@ from cotarget import metrics
 from cotarget.control import zoom
 from cotarget.control.zoom import ExpectedTarget, ZoomController, ZoomSettings, chance_inside, expect, longest_focal
 from cotarget.estimation import TargetFilter
-from tests.moving_targets import APART, Flight, show
+from tests.support.moving_targets import APART, Flight, show
 
 SIZE = (640, 480)
 RANGE = (690.0, 8000.0)

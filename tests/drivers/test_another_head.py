@@ -10,7 +10,7 @@ from cotarget.drivers.interlock import PositionLostError
 from cotarget.drivers.polled_head import AxisFacts, CutError, Poll, PolledHead
 from cotarget.drivers.serial_line import RefusedError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
-from tests.simulated_clock import SimClock
+from tests.support.simulated_clock import SimClock
 
 STEP = math.radians(0.1)
 FACTS = AxisFacts(STEP, -900, 900, slowest=10, fastest=500, acceleration=1000, still_s=0.11)

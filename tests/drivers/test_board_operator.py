@@ -14,7 +14,7 @@ from cotarget.drivers.board import BoardSettings, PersonBoard, SocketBoard, in_w
 from cotarget.emulators.serve import JsonLines
 from cotarget.errors import DeviceError
 from cotarget.geometry import pose
-from tests.synthetic_rig import SyntheticRig, _Board
+from tests.support.synthetic_rig import SyntheticRig, _Board
 
 DEADLINE_S = 30.0  # for what should come at once
 

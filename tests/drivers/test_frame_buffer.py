@@ -11,7 +11,7 @@ from cotarget.drivers import frame_buffer
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, RefusedError
 from cotarget.errors import DeviceError, StaleFrameError
-from tests.simulated_clock import SimClock
+from tests.support.simulated_clock import SimClock
 
 SIZE, LATENCY_S, FRESH_S = (32, 24), 0.1, 0.5
 PATIENCE_S = 10.0  # for what should happen at once

@@ -27,7 +27,7 @@ from cotarget.drivers.frame_buffer import FrameBuffer
 from cotarget.drivers.gphoto import GphotoLink, LinkError, Setting, cameras, full_port, probe
 from cotarget.drivers.gphoto_camera import GphotoCamera, GphotoSettings, SharedState, Shooting, freshness
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
-from tests.simulated_clock import SimClock
+from tests.support.simulated_clock import SimClock
 
 SIZE, STILL_SIZE = (32, 24), (64, 48)
 CONFIG = GphotoSettings(port="usb:", size=SIZE, still_size=STILL_SIZE, latency_s=0.1)

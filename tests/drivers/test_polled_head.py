@@ -7,8 +7,8 @@ import serial
 
 from cotarget.drivers.interlock import PositionLostError
 from cotarget.errors import DeviceError
-from tests.d46_bench import Bench
-from tests.d46_peer import BANNER
+from tests.support.d46_bench import Bench
+from tests.support.d46_peer import BANNER
 
 BYTE = 10 / 9600
 FROM_FAULT_TO_HALT = 0.5  # issue 4's figure [s]

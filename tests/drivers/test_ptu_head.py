@@ -13,7 +13,7 @@ from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.polled_head import Move
 from cotarget.drivers.ptu_d46 import D46Head, D46Settings
 from cotarget.errors import ConfigError, DeviceError, HaltedError
-from tests.d46_bench import CONFIG, Bench
+from tests.support.d46_bench import CONFIG, Bench
 
 STEP = math.radians(185.1428 / 3600)
 CARELESS = SafetyConfig()

@@ -6,7 +6,7 @@ import serial
 from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.ptu_d46 import reset
 from cotarget.errors import DeviceError, EmergencyStopError
-from tests.d46_bench import CONFIG, Bench
+from tests.support.d46_bench import CONFIG, Bench
 
 SOON_S = 0.2  # from a stop to the halt on the wire; a hundredth of what the reset takes
 BOTH = b"!T!T!P!P"

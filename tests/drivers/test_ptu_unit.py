@@ -9,9 +9,9 @@ import serial
 from cotarget.drivers.ptu_d46 import D46Head, UncalibratedError, probe
 from cotarget.drivers.ptu_protocol import open_line
 from cotarget.errors import ConfigError, DeviceError
-from tests.d46_bench import CONFIG, Bench
-from tests.d46_peer import BANNER, VERSION
-from tests.simulated_clock import SimClock
+from tests.support.d46_bench import CONFIG, Bench
+from tests.support.d46_peer import BANNER, VERSION
+from tests.support.simulated_clock import SimClock
 
 # What may be sent while nobody moves the head: nothing that moves it, or wears its memory.
 HARMLESS = {"ED", "FT", "E", "F", "V", "WP", "C", "CI", "I", "H", "PP", "TP"}

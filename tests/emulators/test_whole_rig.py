@@ -22,7 +22,7 @@ from cotarget.config import RigConfig
 from cotarget.emulators.emulation import FAULTS
 from cotarget.targeting import Reach, WantedSize, aim, point_at
 from tests.cli.test_commands import call
-from tests.emulated_rig import DEADLINE_S, PASSWORD, Watch, emulated, meanwhile, program, way
+from tests.support.emulated_rig import DEADLINE_S, PASSWORD, Watch, emulated, meanwhile, program, way
 
 pytestmark = [pytest.mark.wire, pytest.mark.render]
 MOUNT_M = 1.6  # the fixed camera's height above the indoor scene's floor; it looks along the world's y axis

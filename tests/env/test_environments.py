@@ -17,7 +17,7 @@ from cotarget.env.follow import TRACK_FEATURES
 from cotarget.env.schedule import SLOTS
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.evaluation import TruthNoise
-from tests.env_episodes import FRAME_S, field_rig, run
+from tests.support.env_episodes import FRAME_S, field_rig, run
 
 NO_NOISE = TruthNoise(center_px=0.0, size=0.0, miss=0.0)
 STILL = np.zeros(3, np.float32)

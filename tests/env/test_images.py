@@ -14,7 +14,7 @@ from cotarget.env import FOLLOW, Follow, Schedule
 from cotarget.env.common import DEFAULT_RIG
 from cotarget.errors import DeviceError
 from cotarget.sim.render import opengl
-from tests.env_episodes import field_rig, run, uncollected
+from tests.support.env_episodes import field_rig, run, uncollected
 
 pytestmark = pytest.mark.render
 STILL = np.zeros(3, np.float32)

@@ -13,8 +13,8 @@ from cotarget.env.schedule import CANDIDATE_FEATURES, SLOTS
 from cotarget.evaluation import closeup_of, true_calibration
 from cotarget.geometry import pose
 from cotarget.metrics import SERVED_S
-from tests.env_episodes import FRAME_S, field_rig, run
-from tests.rigs import with_zoom_head
+from tests.support.env_episodes import FRAME_S, field_rig, run
+from tests.support.rigs import with_zoom_head
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from cotarget.config import RigConfig, SafetyConfig
 from cotarget.env import FOLLOW, Follow, PipelinePolicy, Schedule
 from cotarget.env.common import DEFAULT_RIG
 from cotarget.errors import ConfigError
-from tests.env_episodes import FIELD, field_rig, run, uncollected
+from tests.support.env_episodes import FIELD, field_rig, run, uncollected
 
 STILL = np.zeros(3, np.float32)
 ROUNDING = 1e-9  # of an angle [rad]

@@ -11,9 +11,9 @@ from cotarget.detection import Detection
 from cotarget.estimation import TargetFilter, filter_settings
 from cotarget.pipeline import State, follow
 from experiments.calibration.synthetic.rig import SIZE, Truth
-from tests.moving_targets import calibration_of
 from tests.pipeline.test_follow import CALIBRATION, PLAIN, Rig
-from tests.rigs import rig_of
+from tests.support.moving_targets import calibration_of
+from tests.support.rigs import rig_of
 
 RATE = 15.0
 LAST = np.array(SIZE) - 0.5  # right and lower edge of the image [px]

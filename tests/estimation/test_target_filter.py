@@ -21,8 +21,8 @@ from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import Reach, aim, depth_of, point_at
 from cotarget.tracking.track import LiveTrack, tracking_settings
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth
-from tests.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
-from tests.rigs import with_zoom_head
+from tests.support.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
+from tests.support.rigs import with_zoom_head
 
 SPLIT = 0.15  # by which two predictions may differ from one, in variances: a person over half a second
 TRIANGULATED = 0.15  # of the logarithm of a depth by 0.4 m of baseline, 0.1 foretold, and half as much for three runs

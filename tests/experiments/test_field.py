@@ -25,7 +25,7 @@ from experiments.following import dead_zone, delay, env_score, field, first_shot
 from experiments.following.field_scenes import hold_config
 from experiments.following.shots import CAUSES, Shot, budget
 from experiments.following.wide_view import Seen, WideView, open_on, record
-from tests.rigs import with_zoom_head
+from tests.support.rigs import with_zoom_head
 
 FIELD = (hold, first_shot, delay, five_targets, dead_zone, sim_speed)
 SMALL = 0.03  # relative: products of angles of a hundredth that are taken for sums

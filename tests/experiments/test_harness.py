@@ -25,7 +25,7 @@ from experiments.calibration.synthetic.rig import SIZE, Lens, Stop, Truth, undis
 from experiments.calibration.synthetic.views import Placing, spread_views, views_at_stops
 from experiments.engine.harness import Experiment, Settings
 from experiments.engine.texts import rms, table
-from tests.tiny_experiments import TINY
+from tests.support.tiny_experiments import TINY
 
 PHOTOS = Path(__file__).parents[3] / "shared" / "data" / "opencv_stereo"
 STILL = RigidTransform.identity()

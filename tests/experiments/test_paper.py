@@ -23,7 +23,7 @@ from experiments.engine.workers import here
 from experiments.paper import fig4_book, fig5_person, fig6_outdoors, table2_table3, worked_example
 from experiments.paper.handover import Moment, figures
 from experiments.paper.paper_loop import OURS
-from tests.tiny_experiments import TINY
+from tests.support.tiny_experiments import TINY
 
 ROUNDING = 1e-9  # relative, or of millimetres of ten metres
 PICTURES = (fig4_book, fig5_person, fig6_outdoors)

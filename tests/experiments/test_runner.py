@@ -30,7 +30,7 @@ from experiments.engine.results import FORMAT, LOCK, Record, Spent, code_version
 from experiments.engine.sessions import Session, Share, sessions
 from experiments.engine.tasks import Task, perform
 from experiments.engine.workers import LINEAR_ALGEBRA, ONE_THREAD, Died, here, in_processes
-from tests.tiny_experiments import ALONE, KNOWN, TINY, knows_its_code, notes, pids
+from tests.support.tiny_experiments import ALONE, KNOWN, TINY, knows_its_code, notes, pids
 
 DEADLINE_S = 120.0  # for a program to come as far as it is waited for
 QUICKLY_S = 60.0  # for a program to end that is interrupted, on a busy machine; its jobs would take for ever
@@ -336,7 +336,7 @@ def test_a_file_that_cannot_be_read(run, tmp_path):
 def started(tmp_path):
     """The command as a program of its own, with a job that waits for ever once the others are done."""
     arguments = [*noted(tmp_path, "tiny"), "--set", "tiny.gated=[2, 3]", "--out", str(tmp_path / "out")]
-    command = [sys.executable, "-m", "tests.tiny_experiments", "tiny", "--processes", "2", *arguments]
+    command = [sys.executable, "-m", "tests.support.tiny_experiments", "tiny", "--processes", "2", *arguments]
     os.mkfifo(tmp_path / "gate")
     programs = []
 

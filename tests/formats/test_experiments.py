@@ -30,7 +30,7 @@ from tests.formats.lists import (
     read,
     statuses,
 )
-from tests.tiny_experiments import KNOWN as TINY_KNOWN
+from tests.support.tiny_experiments import KNOWN as TINY_KNOWN
 
 KNOWN = known_experiments()
 QUICKEST = ("hand_eye", "depth_error", "shortcut", "worked_example")  # a fraction of a second each

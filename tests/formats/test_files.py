@@ -56,7 +56,7 @@ from tests.formats.lists import (
     run,
     table_rows,
 )
-from tests.rigs import rig_of
+from tests.support.rigs import rig_of
 
 
 @pytest.fixture

@@ -40,9 +40,9 @@ from tests.pipeline.test_follow import (
     spans,
     still,
 )
-from tests.recorded_run import ToyDevices, calibration_file, record
-from tests.recorded_run import run as recorded
-from tests.rigs import guarded, rig_of
+from tests.support.recorded_run import ToyDevices, calibration_file, record
+from tests.support.recorded_run import run as recorded
+from tests.support.rigs import guarded, rig_of
 
 FRAME_S = 1 / RATE_HZ
 FAULT = 1.5  # when it happens [s]; by then the target is followed

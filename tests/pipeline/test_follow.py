@@ -19,7 +19,7 @@ from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.motion import Axis
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
-from tests.rigs import rig_of
+from tests.support.rigs import rig_of
 
 RATE_HZ = 24.0  # neither 0.4 s nor 0.8 s is a whole number of frames
 LATENCY = 0.06

@@ -15,7 +15,7 @@ from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, Rig, ZoomState
 from tests.cli.test_commands import true_calibration
-from tests.rigs import guarded
+from tests.support.rigs import guarded
 
 pytestmark = pytest.mark.render
 TABLE = {"sim": {"scene": "indoor", "targets": ["book"], "seed": 3}}

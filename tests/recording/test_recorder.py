@@ -25,9 +25,9 @@ from cotarget.recording.replay import Replay
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.targeting import Aim
 from cotarget.tracking.track import Track
-from tests.full_disk import SAID, full_disk
-from tests.recorded_run import CONFIG, SIZE, ToyDevices, calibration_file, record, run, toy_rig
-from tests.rigs import guarded, rig_of
+from tests.support.full_disk import SAID, full_disk
+from tests.support.recorded_run import CONFIG, SIZE, ToyDevices, calibration_file, record, run, toy_rig
+from tests.support.rigs import guarded, rig_of
 
 PICTURE = np.zeros((4, 4, 3), np.uint8)
 IMAGE_BYTES = SIZE[0] * SIZE[1] * 3

@@ -32,7 +32,7 @@ from cotarget.recording.replay import Differences, RecordingEndedError, Replay, 
 from cotarget.rig import PanTiltState
 from cotarget.sim.world import SimWorld
 from tests.cli.test_commands import true_calibration
-from tests.recorded_run import (
+from tests.support.recorded_run import (
     CONFIG,
     FOCALS,
     LIMITS,
@@ -48,7 +48,7 @@ from tests.recorded_run import (
     run,
     toy_rig,
 )
-from tests.rigs import guarded
+from tests.support.rigs import guarded
 
 SECONDS = 2.0
 DEADLINE_S = 60.0  # for what should come at once
@@ -674,7 +674,7 @@ def test_no_damage_ends_in_anything_but_one_of_our_errors(copy):
 @pytest.mark.parametrize("steps", [3, 17, 40])
 def test_a_run_that_is_killed_replays_up_to_shortly_before(tmp_path, steps):
     """SIGKILL while it records: what it said it had done is there, but for what was still on its way to the disk."""
-    command = [sys.executable, "-m", "tests.recorded_run", str(tmp_path)]
+    command = [sys.executable, "-m", "tests.support.recorded_run", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         late = threading.Timer(DEADLINE_S, process.kill)  # then its lines end
         late.start()

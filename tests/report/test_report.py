@@ -37,8 +37,8 @@ from cotarget.report.text import advice, correlations, digits, judge, percent, v
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, SIZES, Lens, Stop, Truth
 from experiments.calibration.synthetic.views import Placing, noisy, placed, synthetic_views, views_at_stops, zoom_view
-from tests.full_disk import SAID, full_disk
-from tests.rigs import with_zoom_head
+from tests.support.full_disk import SAID, full_disk
+from tests.support.rigs import with_zoom_head
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

@@ -11,8 +11,8 @@ import pytest
 from cotarget.config import SafetyConfig
 from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 from cotarget.safety.stop_file import clear_stop_file, refuse_if_stopped, stop_reason, write_stop_file
-from tests.rigs import guarded
-from tests.safety_rigs import RealDevices, SimulatedDevices
+from tests.support.rigs import guarded
+from tests.support.safety_rigs import RealDevices, SimulatedDevices
 
 FAR = math.radians(100)
 DEADLINE_S = 10.0  # for a thread that should end at once; a machine may be busy

@@ -11,7 +11,7 @@ import pytest
 from cotarget.config import SafetyConfig
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState
-from tests.rigs import guarded, rig_of
+from tests.support.rigs import guarded, rig_of
 
 STEP = math.radians(0.0514286)
 SPEED = math.radians(149.0)

@@ -13,8 +13,8 @@ from cotarget.config import SafetyConfig, SimHead
 from cotarget.errors import DeviceError, EmergencyStopError, StaleFrameError
 from cotarget.rig import Frame, PanTiltState
 from cotarget.safety import stop_file, watchdog
-from tests.rigs import guarded
-from tests.safety_rigs import DEADLINE_S, IMAGE, RealDevices, SimulatedDevices
+from tests.support.rigs import guarded
+from tests.support.safety_rigs import DEADLINE_S, IMAGE, RealDevices, SimulatedDevices
 
 WATCHDOG_S = 0.35  # the default
 FAR = math.radians(100)

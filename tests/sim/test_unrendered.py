@@ -7,7 +7,7 @@ from cotarget.config import SafetyConfig, parse_config
 from cotarget.errors import DeviceError
 from cotarget.geometry import pose
 from cotarget.sim.world import SimWorld
-from tests.rigs import guarded
+from tests.support.rigs import guarded
 
 
 def drive(w):

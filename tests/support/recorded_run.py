@@ -1,6 +1,6 @@
 """A rig of a few lines that makes real pictures, and a run on it that is recorded: for tests, and to be killed.
 
-As a program: `python -m tests.recorded_run FOLDER` records without end and prints a line after every step.
+As a program: `python -m tests.support.recorded_run FOLDER` records without end and prints a line after every step.
 """
 
 import itertools
@@ -23,7 +23,7 @@ from cotarget.pipeline import FollowSettings, follow
 from cotarget.recording.recorder import Recorder
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
-from tests.rigs import guarded, rig_of
+from tests.support.rigs import guarded, rig_of
 
 SIZE = (96, 72)
 RATE_HZ, ZOOM_RATE_HZ = 25.0, 10.0

@@ -28,7 +28,7 @@ PASSWORD = "open sesame"
 
 def program(*arguments, **options):
     """The command line in a process of its own."""
-    path = os.pathsep.join([str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-m", "cotarget.cli", *map(str, arguments)]
     return subprocess.Popen(
         command,

@@ -15,7 +15,7 @@ from cotarget.errors import StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Stop, Truth
-from tests.rigs import rig_of
+from tests.support.rigs import rig_of
 
 PERIOD = 0.04
 LATENCY = 0.05

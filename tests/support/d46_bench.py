@@ -3,8 +3,8 @@
 from cotarget.drivers.polled_head import Halt, Loop, Move
 from cotarget.drivers.ptu_d46 import D46Link, D46Settings
 from cotarget.drivers.ptu_protocol import Line
-from tests.d46_peer import SimPort, Unit
-from tests.simulated_clock import SimClock
+from tests.support.d46_peer import SimPort, Unit
+from tests.support.simulated_clock import SimClock
 
 # With pan in the unit's own sense, so that what is sent is what the tests say.
 CONFIG = D46Settings(port="PORT", pan_deg=(-158.9, 158.9), tilt_deg=(-46.6, 31.1), pan_sign=1, command_delay_s=0.04)
