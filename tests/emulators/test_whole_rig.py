@@ -210,7 +210,9 @@ def check_calibration(rig, capsys, placements, stops):
     status, said, err = run(capsys, "calibrate", *files, "--placements", placements, "--stops", stops)
     assert status == 0, err
     said, truth, found = json.loads(said), load_calibration(rig.calibration), load_calibration(out)
-    assert said["baseline_m"] == pytest.approx(np.linalg.norm(truth.T_zoom0_fixed.translation), abs=BASELINE_M)
+    assert said["baseline_m"] == pytest.approx(
+        np.linalg.norm(truth.zoom_head.T_zoom0_fixed.translation), abs=BASELINE_M
+    )
     predicted = next(iter(said["predicted_error_deg"].values()))  # at the shortest focal length
     spec = describe(load_config(rig.sim))
     reach = Reach(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range)
