@@ -9,7 +9,7 @@ import dataclasses
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,7 +26,7 @@ from cotarget.drawing import TargetStages, captioned, draw_frames, plot_aim_erro
 from cotarget.errors import ConfigError
 from cotarget.evaluation import add_row, pointing_errors
 from cotarget.metrics import Row, Score, score, write_rows
-from cotarget.parallel import run_apart
+from cotarget.parallel import Progress, run_apart
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
@@ -44,8 +44,6 @@ FRONT_DEG, BACK_DEG = -62.0, 118.0  # directions of the two pictures of the rig
 UNFINISHED = ".unfinished-"  # prefix of the folder in which a run works
 ABANDONED_S = 3600.0  # age from which such a folder is taken to be left by a killed run
 
-Progress = Callable[[str, int, int], None]
-
 
 def run_demo(out: Path, seed: int, progress: Progress) -> dict[str, Any]:
     """Calibrate a simulated rig from rendered boards, follow a book, a person and a bird, and write the results.
@@ -53,7 +51,7 @@ def run_demo(out: Path, seed: int, progress: Progress) -> dict[str, Any]:
     Args:
         out: folder for pictures, video, tables and metrics.json; its files are replaced only when all is done.
         seed: seed of everything random.
-        progress: called with (what, done, total).
+        progress: called with (done, total, what).
 
     Returns:
         The content of metrics.json.
@@ -122,7 +120,7 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
             config.board,
             pitch_mm=config.sim.zoom.pitch_mm,
             seed=seed,
-            progress=lambda done, total, text: progress(f"calibrating: {text}", done, total),
+            progress=lambda done, total, text: progress(done, total, f"calibrating: {text}"),
         )
         save_calibration(work / "calibration.json", calibration)
         errors = np.degrees(
@@ -165,7 +163,7 @@ def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, prog
             stages.see(step)
             add_row(rows, step, truth, name, target)
             film.write(side_by_side(step, name, step.fixed.t), step.fixed.t)
-            progress(f"following: {name}", min(step.index + 1, frames), frames)
+            progress(min(step.index + 1, frames), frames, f"following: {name}")
     write_picture(work / f"{name}.png", stages.picture(name))
     return rows
 

@@ -14,6 +14,7 @@ from cotarget.drawing import draw_box
 from cotarget.errors import CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
+from cotarget.parallel import Progress
 from cotarget.rig import Image
 from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
@@ -24,7 +25,6 @@ COLUMNS = ("frame", "t", "track", "u_px", "v_px", "width_px", "height_px", "scor
 TRAIL_S = 1.0
 # Colours (BGR) that are distinct on sky, grass and asphalt; a track keeps its own.
 COLOURS = ((60, 60, 255), (0, 200, 255), (80, 220, 60), (255, 160, 40), (255, 80, 220), (40, 140, 255), (230, 230, 60))
-Progress = Callable[[int, int | None], None]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,6 @@ def run_on_film(
     csv_path: Path,
     drawn: Path | None = None,
     progress: Progress | None = None,
-    template: Image | None = None,
     keep: bool = False,
 ) -> FilmSummary:
     """Detect and track a target in a film.
@@ -71,8 +70,7 @@ def run_on_film(
         target: target profile.
         csv_path: table to write: frame,t,track,u_px,v_px,width_px,height_px,score.
         drawn: film to write with the tracks drawn, if any.
-        progress: called with (frames done, frames in all or None) after every frame.
-        template: image of the target for the detector "colour", BGR.
+        progress: called after every frame with (frames done, frames in all or None, what).
         keep: whether to keep the results so far if the run ends in an error or is interrupted.
 
     Raises:
@@ -81,13 +79,11 @@ def run_on_film(
     for out in (csv_path, drawn):
         if out is not None and out.resolve() == video.resolve():
             raise CotargetError(f"{out}: is the film itself; name another file to write")
-        if out is not None and not out.resolve().parent.is_dir():
-            raise CotargetError(f"{out}: its folder does not exist; name a file in an existing folder")
     with Film(video) as film, CsvFile(csv_path, COLUMNS, keep=keep, line_end="\n") as table:
         if drawn is None:
-            return _run(film, target, table.write, None, progress, template)
+            return _run(film, target, table.write, None, progress)
         with FilmWriter(drawn, film.rate_hz, keep=keep) as out_film:
-            return _run(film, target, table.write, out_film.write, progress, template)
+            return _run(film, target, table.write, out_film.write, progress)
 
 
 def _run(
@@ -96,10 +92,9 @@ def _run(
     write_row: Callable[[list[str]], object],
     write_image: Callable[[Image, float], None] | None,
     progress: Progress | None,
-    template: Image | None,
 ) -> FilmSummary:
     """Process the film once."""
-    detector = make_detector(target, film.rate_hz, template)
+    detector = make_detector(target, film.rate_hz)
     tracker = Tracker(tracking_settings(target), film.size)
     trails = Trails()
     numbers: set[int] = set()
@@ -115,7 +110,7 @@ def _run(
         if write_image is not None:
             write_image(trails.draw(frame.image, tracks, frame.t), frame.t)
         if progress is not None:
-            progress(film.number + 1, film.count)
+            progress(film.number + 1, film.count, "detecting")
     duration = max(times) - min(times)
     return FilmSummary(
         len(times), with_target, len(numbers), duration, film.rate_hz, film.number, film.shortfall or None

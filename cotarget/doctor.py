@@ -61,7 +61,7 @@ def examine(config: "RigConfig | None" = None, rig: Path = Path("rig.toml")) -> 
         _python(),
         *map(_package, PACKAGES),
         _assets(),
-        _rendering(),
+        rendering(),
         _codec(),
         _serial_ports(),
         _gphoto_cameras(needed=_is_real(config)),
@@ -79,13 +79,8 @@ def _is_real(config: "RigConfig | None") -> bool:
 
 def _python() -> Finding:
     ok = sys.version_info >= OLDEST_PYTHON
-    wanted = ".".join(map(str, OLDEST_PYTHON))
-    return Finding(
-        "python",
-        ok,
-        f"{platform.python_version()} on {platform.platform()}",
-        "" if ok else f"install Python {wanted} or newer",
-    )
+    fix = "" if ok else f"install Python {'.'.join(map(str, OLDEST_PYTHON))} or newer"
+    return Finding("python", ok, f"{platform.python_version()} on {platform.platform()}", fix)
 
 
 def _package(name: str) -> Finding:
@@ -101,7 +96,8 @@ def _assets() -> Finding:
     return Finding("sim_assets", bool(scenes), f"scenes {', '.join(scenes)}" if scenes else "not found", fix)
 
 
-def _rendering() -> Finding:
+def rendering() -> Finding:
+    """Render a picture without a screen, in a process of its own."""
     try:
         tried = subprocess.run(
             [sys.executable, "-c", RENDER], capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False
@@ -121,13 +117,9 @@ def _codec() -> Finding:
         import av
     except ImportError as error:
         return Finding("H.264", False, f"PyAV cannot be imported: {error}", "pip install --force-reinstall av")
-    ok = "libx264" in av.codecs_available
-    return Finding(
-        "H.264",
-        ok,
-        "PyAV encodes it" if ok else "this PyAV cannot encode it",
-        "" if ok else "pip install --force-reinstall av",
-    )
+    if "libx264" in av.codecs_available:
+        return Finding("H.264", True, "PyAV encodes it")
+    return Finding("H.264", False, "this PyAV cannot encode it", "pip install --force-reinstall av")
 
 
 def _serial_ports() -> Finding:
@@ -163,7 +155,7 @@ def _emergency_stop(config: "RigConfig", rig: Path) -> Finding:
         return Finding(name, False, str(error), f"cotarget clear --rig {rig}")
     except ConfigError as error:
         return Finding(name, False, str(error), f"{'chmod u+w' if path.parent.is_dir() else 'mkdir -p'} {path.parent}")
-    return Finding(name, True, "nobody has called for one")
+    return Finding(name, True, "there is none")
 
 
 def _own_detectors(config: "RigConfig", rig: Path) -> list[Finding]:

@@ -112,7 +112,7 @@ class PartFile:
                     error.add_note(f"{self._name} holds what there was until then")
         except (OSError, CotargetError) as failure:
             if error is None:
-                raise said(self._name, failure) from None
+                raise write_error(self._name, failure) from None
             if keep:
                 error.add_note(f"{self._name} could not be completed")
         finally:
@@ -150,11 +150,11 @@ def _lock(descriptor: int) -> None:
         pass
 
 
-def said(path: Path, failure: OSError | CotargetError) -> CotargetError:
+def write_error(path: Path, failure: OSError | CotargetError) -> CotargetError:
     """Make an error that names the file, which a full disk's error does not."""
-    return (
-        failure if isinstance(failure, CotargetError) else ConfigError(f"{path}: cannot be written: {failure.strerror}")
-    )
+    if isinstance(failure, CotargetError):
+        return failure
+    return ConfigError(f"{path}: cannot be written: {failure.strerror}")
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -225,7 +225,7 @@ class CsvFile:
             write_all(self._file, line.encode())
         except OSError as error:
             self._file.truncate(begin)
-            raise said(self._path, error) from None
+            raise write_error(self._path, error) from None
 
     def __enter__(self) -> "CsvFile":
         """Return the table itself."""

@@ -40,7 +40,7 @@ BEFORE_S, AFTER_S = 0.5, 0.5  # frames are kept from this long before a command 
 # before most of the way, because no lens travels evenly all the way.
 FIRST, LAST = 0.08, 0.5
 # Largest relative difference between the image's growth and the lens's report; beyond it something else made it grow.
-AS_TOLD = 0.25
+AS_REPORTED = 0.25
 CORNERS, WEAKEST, APART_PX = 200, 0.01, 8
 FEWEST_CORNERS = 12  # with fewer corners there is no scale
 
@@ -86,11 +86,11 @@ def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
         frames += _moving_frames(rig, frames)
         count += len(frames)
         grown = scales([frame.image for frame in frames])
-        told = math.log(after / before)
-        if not abs(grown[-1] - told) <= AS_TOLD * abs(told):
+        reported = math.log(after / before)
+        if not abs(grown[-1] - reported) <= AS_REPORTED * abs(reported):
             seen = "shows too little" if math.isnan(grown[-1]) else f"grows {math.exp(grown[-1]):.2f} times"
             raise CalibrationError(
-                f"the zoom camera's picture {seen} where the lens tells of {after / before:.2f} times; point it at "
+                f"the zoom camera's picture {seen} where the lens reports {after / before:.2f} times; point it at "
                 "something with structure that stands still, all over the picture"
             )
         times = np.array([frame.t for frame in frames]) - late_s
@@ -178,6 +178,9 @@ AGREEMENT = 0.9  # least correlation of two records
 ASIDE = np.radians(1.0)  # farther from straight ahead than this, the head measures there where it sees no motion [rad]
 BANDS = 3  # horizontal parts of the image that are compared one by one where the whole does not move
 EARLY = 0.4  # part of a turn's way in which the head still accelerates
+# Largest ratio of true and stated acceleration; from here on, the start of a turn is wrong by more than some 10 ms.
+MISFIT = 1.5
+FEWEST_REPORTS = 3  # different reports in that part of a turn, to see how the head accelerates
 BOARD_SHARE, BOARD_TURNED = 0.35, 15.0  # part of the fixed image's width that the board fills; its turn [degrees]
 
 
@@ -352,10 +355,10 @@ def delay_between(t: Array, values: Array, t_other: Array, other: Array) -> Dela
         inside = (t - delay >= t_other[0]) & (t - delay <= t_other[-1])
         if inside.sum() < FEWEST:
             return 1.0
-        told = np.interp(t[inside] - delay, t_other, other)
-        if np.ptp(told) == 0 or np.ptp(values[inside]) == 0:
+        shifted = np.interp(t[inside] - delay, t_other, other)
+        if np.ptp(shifted) == 0 or np.ptp(values[inside]) == 0:
             return 1.0
-        return 1.0 - float(np.corrcoef(values[inside], told)[0, 1] ** 2)
+        return 1.0 - float(np.corrcoef(values[inside], shifted)[0, 1] ** 2)
 
     tried = np.arange(-LONGEST_DELAY, LONGEST_DELAY + COARSE / 2, COARSE)
     best = float(tried[np.argmin([disagreement(delay) for delay in tried])])
@@ -385,16 +388,26 @@ def command_delay(
 
     Returns:
         The delay; nan if no report fell into the early part of any turn.
+
+    Raises:
+        CalibrationError: the head accelerates otherwise, so that its motion does not give the time of its start.
     """
     times = np.array([state.t for state in states])
     pans = np.array([state.pan for state in states])
-    found = []
+    found, slopes = [], []
     for (t, before, goal), (until, *_) in zip(starts, [*starts[1:], (np.inf, 0.0, 0.0)], strict=True):
         gone = np.abs(pans - before)
         early = (times > t) & (times < until) & (gone > 0) & (gone < EARLY * abs(goal - before))
-        began = times[early] - np.sqrt(2 * gone[early] / acceleration)
+        since = np.sqrt(2 * gone[early] / acceleration)
         if early.any():
-            found.append(float(np.median(began)) - t)
+            found.append(float(np.median(times[early] - since)) - t)
+        if len(np.unique(since)) >= FEWEST_REPORTS:
+            slopes.append(np.polyfit(times[early], since, 1)[0])  # 1 where the acceleration is right
+    if slopes and not 1 / MISFIT <= (ratio := np.median(slopes) ** 2) <= MISFIT:
+        raise CalibrationError(
+            f"the motion of the head does not fit its acceleration of {np.degrees(acceleration):.0f} degrees/s^2, but "
+            f"one of some {np.degrees(ratio * acceleration):.0f}; correct the head's limits"
+        )
     return float(np.median(found)) if found else np.nan
 
 

@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 from cotarget.errors import CotargetError
 
 Result = TypeVar("Result")
+# Called with what is done, how much there is (None where no end is known), and a text.
+Progress = Callable[[float, float | None, str], object]
 ORPHANED = 1  # exit status of a process whose parent has ended
 
 

@@ -103,7 +103,7 @@ class Places:
         self._lost += count
         self.number += count
 
-    def told(self, *, ended: bool) -> str:
+    def describe(self, *, ended: bool) -> str:
         """Describe what was lost, after the last frame; empty if nothing was.
 
         Args:
@@ -223,7 +223,7 @@ class Film:
                 f"{self.path}: holds no frame that can be decoded{reason or places.reason}; give a complete film"
             )
         ending = self._shortfall(damaged) or (f"what follows cannot be decoded{reason}" if reason else "")
-        self.shortfall = "; ".join(filter(None, (places.told(ended=bool(ending)), ending)))
+        self.shortfall = "; ".join(filter(None, (places.describe(ended=bool(ending)), ending)))
 
     def _pictures(self, places: Places) -> Iterator[av.VideoFrame]:
         """Decode the first video stream; packets of all streams are read to find their end."""
@@ -248,17 +248,17 @@ class Film:
     def _shortfall(self, damaged: bool) -> str:
         """Describe what the container states beyond what was read, or that the last frame is damaged."""
         stream, container = self._container.streams.video[0], self._container
-        begin, told = 0.0, 0.0
+        begin, stated = 0.0, 0.0
         if container.format.name == "avi" and stream.frames and stream.time_base is not None:
-            told = float(stream.frames * stream.time_base)  # FFmpeg estimates AVI's duration from the file's size
+            stated = float(stream.frames * stream.time_base)  # FFmpeg estimates AVI's duration from the file's size
         elif container.format.name in TELL_DURATION and container.duration is not None:
-            begin, told = (container.start_time or 0) / MICROSECONDS, container.duration / MICROSECONDS
-        if begin + told - self._end > max(SHORT_S, SHORT_FRAMES / self.rate_hz):
-            return f"the film says that it lasts {told:.1f} s, and ends at {max(self._end - begin, 0.0):.1f} s"
+            begin, stated = (container.start_time or 0) / MICROSECONDS, container.duration / MICROSECONDS
+        if begin + stated - self._end > max(SHORT_S, SHORT_FRAMES / self.rate_hz):
+            return f"the film says that it lasts {stated:.1f} s, and ends at {max(self._end - begin, 0.0):.1f} s"
         # In AVI every frame is a slot of its time, even an empty one; a lost frame makes the others come too early.
         if container.format.name == "avi" and (lost := stream.frames - self._slots) > 0:
-            told_count = f"of the {stream.frames} frames that it says it has {lost} are lost"
-            return f"{told_count}, and those after them come too early"
+            stated_count = f"of the {stream.frames} frames that it says it has {lost} are lost"
+            return f"{stated_count}, and those after them come too early"
         return "its last frame is damaged" if damaged else ""
 
 

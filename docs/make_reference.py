@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import griffe
 
 from cotarget.backends import check
-from cotarget.cli.main import _parser
+from cotarget.cli.main import make_parser
 from cotarget.config import DEFAULT_TARGETS, HardwareConfig, RigConfig, parse_config
 from cotarget.drivers import DRIVERS
 from cotarget.drivers.board import BoardSettings
@@ -157,7 +157,7 @@ def _refusal(key: str, driver: str, value: float) -> str:
 
 def command_line() -> str:
     """Describe every command and its arguments."""
-    commands = next(a for a in _parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+    commands = next(a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
     parts = []
     for name, parser in commands.items():
         parser.formatter_class = partial(argparse.HelpFormatter, width=96)

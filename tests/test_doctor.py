@@ -4,7 +4,6 @@ import os
 import socket
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -77,11 +76,6 @@ def test_a_package_that_cannot_be_imported_does_not_stop_the_doctor(tried, monke
     assert broken[0].fix.startswith("pip install")
 
 
-def rig(port, presenter="person"):
-    hardware = {"zoom": {"port": port}, "board": {"presenter": presenter}}
-    return parse_config({"backend": "hardware", "hardware": hardware})
-
-
 def findings(config):
     return {f.name: f for f in doctor.examine(config)}
 
@@ -89,31 +83,29 @@ def findings(config):
 def test_a_simulated_rig_does_without_gphoto2_and_a_real_one_does_not(tried, monkeypatch):
     monkeypatch.setitem(sys.modules, "gphoto2", None)
     assert finding("gphoto2 cameras").ok
-    found = findings(rig("usb:"))
+    found = findings(real(zoom={"port": "usb:"}))
     missing = found["gphoto2 cameras"]
     assert (missing.ok, missing.fix) == (False, "pip install 'cotarget[hardware]'")
-    assert found["hardware.zoom"].text == "gphoto2 is not installed; pip install 'cotarget[hardware]'"
+    assert "cotarget[hardware]" in found["hardware.zoom"].text
 
 
 def test_the_zoom_camera_and_who_holds_the_board_are_looked_for(tried):
     """Port 1 of this machine is nobody's; a person is always there."""
     pytest.importorskip("gphoto2")
-    found = findings(rig("ptpip:127.0.0.1:1"))
-    assert not found["hardware.zoom"].ok
-    assert found["hardware.zoom"].text.startswith("hardware.zoom.port: no camera listens at 'ptpip:127.0.0.1:1:1'")
-    assert found["hardware.board"] == Finding("hardware.board", True, "a person")
-    found = findings(rig("", "socket://127.0.0.1:1"))
-    assert found["hardware.zoom"].text == "is not configured"
-    assert not found["hardware.board"].ok
-    assert found["hardware.board"].text.startswith("hardware.board.presenter: nobody holds a board at socket://127")
+    found = findings(real(zoom={"port": "ptpip:127.0.0.1:1"}))
+    assert (found["hardware.zoom"].ok, found["hardware.board"].ok) == (False, True)
+    assert "'ptpip:127.0.0.1:1:1'" in found["hardware.zoom"].text
+    found = findings(real(board={"presenter": "socket://127.0.0.1:1"}))
+    assert (found["hardware.zoom"].ok, found["hardware.board"].ok) == (False, False)
+    assert "socket://127" in found["hardware.board"].text
     assert "[hardware.board]" in found["hardware.board"].fix
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        found = findings(rig(f"ptpip:localhost:{port}", f"socket://127.0.0.1:{port}"))
-    assert found["hardware.zoom"] == Finding(
-        "hardware.zoom", True, f"something listens at ptpip:127.0.0.1:{port}:{port}"
-    )
-    assert found["hardware.board"] == Finding("hardware.board", True, f"a program at socket://127.0.0.1:{port}")
+        found = findings(
+            real(zoom={"port": f"ptpip:localhost:{port}"}, board={"presenter": f"socket://127.0.0.1:{port}"})
+        )
+    assert found["hardware.zoom"].ok
+    assert found["hardware.board"].ok
 
 
 @pytest.mark.parametrize(("change", "backend", "text", "fix"), [
@@ -135,18 +127,22 @@ def test_rendering_that_fails(tried, monkeypatch, change, backend, text, fix):
 
 @pytest.mark.render
 def test_rendering_is_really_tried():
-    assert doctor._rendering().ok
+    assert doctor.rendering().ok
 
 
-def test_a_lost_position_is_told(tmp_path):
-    table = {"head": {"port": "/dev/nobody"}, "fixed": {"url": "http://127.0.0.1:1"}, "zoom": {"port": "usb:"}}
-    config = parse_config({"backend": "hardware", "hardware": table, "safety": {"stop_file": str(tmp_path / "stop")}})
+def real(**tables):
+    return parse_config({"backend": "hardware", "hardware": tables})
+
+
+def test_a_lost_position_is_told(tried, tmp_path):
+    config = parse_config(
+        {"backend": "hardware", "hardware": {"head": {"port": "/dev/nobody"}},
+         "safety": {"stop_file": str(tmp_path / "stop")}}
+    )  # fmt: skip
     assert findings(config)["head's position"].ok
     (tmp_path / "stop.dev-nobody.position-lost").write_text("it hit a limit\n")
     lost = findings(config)["head's position"]
-    assert not lost.ok
-    assert lost.text.startswith("it hit a limit")
-    assert "reset-head" in lost.fix
+    assert (lost.ok, "it hit a limit" in lost.text, "reset-head" in lost.fix) == (False, True, True)
 
 
 @pytest.mark.parametrize("backend", ["sim", "hardware"])
@@ -156,11 +152,10 @@ def test_an_emergency_stop_is_told(tried, tmp_path, backend):
     found = findings(config)["emergency stop"]
     assert (found.ok, found.fix) == (False, f"mkdir -p {tmp_path / 'run'}")
     stop.parent.mkdir()
-    assert findings(config)["emergency stop"] == Finding("emergency stop", True, "nobody has called for one")
+    assert findings(config)["emergency stop"].ok
     stop.write_text("a bird in the gears\n")
     found = findings(config)["emergency stop"]
-    assert not found.ok
-    assert found.text.startswith("emergency stop: a bird in the gears; when it is safe to move, run 'cotarget clear")
+    assert (found.ok, "a bird in the gears" in found.text) == (False, True)
     assert found.fix == "cotarget clear --rig rig.toml"
     assert findings(parse_config({"backend": backend}))["emergency stop"].ok
 
@@ -170,66 +165,54 @@ def test_a_port_that_another_program_has_is_told_with_what_names_it(tried):
     port = os.ttyname(ends[1])
     try:
         with serial.Serial(port, exclusive=True):
-            found = findings(parse_config({"backend": "hardware", "hardware": {"head": {"port": port}}}))
+            head = findings(real(head={"port": port}))["hardware.head"]
     finally:
         for end in ends:
             os.close(end)
-    head = found["hardware.head"]
-    assert head == Finding(
-        "hardware.head",
-        False,
-        f"{port} is in use by another program",
-        f"end the program that has it, which 'fuser -v {port}' names",
-    )
+    assert (head.ok, port in head.text, f"fuser -v {port}" in head.fix) == (False, True, True)
 
 
-def test_a_port_that_is_not_for_this_user_is_told_with_the_group(tried, monkeypatch):
-    def denied(*_, **__):
-        raise serial.SerialException(13, "could not open port")
+def denied(*_, **__):
+    raise serial.SerialException(13, "could not open port")
 
-    monkeypatch.setattr(serial, "serial_for_url", denied)
-    head = findings(parse_config({"backend": "hardware", "hardware": {"head": {"port": "/dev/x"}}}))["hardware.head"]
-    assert head.text.startswith("no permission to use /dev/x")
-    assert "dialout" in head.fix
+
+def uncalibrated(port, baud):
+    raise UncalibratedError(f"the pan-tilt unit at {port} is not calibrated")
+
+
+@pytest.mark.parametrize(("replaced", "by", "fix"), [
+    ("serial.serial_for_url", denied, "dialout"),
+    ("cotarget.drivers.ptu_d46.probe", uncalibrated, "cotarget reset-head --rig rig.toml"),
+])  # fmt: skip
+def test_a_head_that_does_not_answer_as_it_should_is_told_with_what_helps(tried, monkeypatch, replaced, by, fix):
+    monkeypatch.setattr(replaced, by)
+    head = findings(real(head={"port": "/dev/x"}))["hardware.head"]
+    assert (head.ok, "/dev/x" in head.text, fix in head.fix) == (False, True, True)
 
 
 def test_the_size_of_real_squares_has_to_be_told(tried, tmp_path):
     path = tmp_path / "hw.toml"
-    path.write_text('backend = "hardware"\n')
-    board = next(f for f in doctor.examine(load_config(path), path) if f.name == "board")
-    assert not board.ok
-    assert board.fix.endswith(f"write one into [board] in {path}: square = 0.025")
-    path.write_text('backend = "hardware"\n[board]\nsquare = 0.0254\n')
-    board = next(f for f in doctor.examine(load_config(path), path) if f.name == "board")
-    assert board == Finding("board", True, "chessboard of 9x6 inner corners, squares of 25.4 mm")
-
-
-def test_a_head_that_has_not_found_its_limits_is_told(tried, monkeypatch):
-    def probe(port, baud):
-        raise UncalibratedError(f"the pan-tilt unit at {port} is not calibrated")
-
-    monkeypatch.setattr("cotarget.drivers.ptu_d46.probe", probe)
-    config = parse_config({"backend": "hardware", "hardware": {"head": {"port": "/dev/x"}}})
-    (head,) = [f for f in doctor.examine(config, Path("hw.toml")) if f.name == "hardware.head"]
-    assert (head.ok, head.fix) == (False, "cotarget reset-head --rig hw.toml")
+    for text, ok in (("", False), ("[board]\nsquare = 0.0254\n", True)):
+        path.write_text(f'backend = "hardware"\n{text}')
+        (board,) = [f for f in doctor.examine(load_config(path), path) if f.name == "board"]
+        assert (board.ok, str(path) in board.fix, "25.4 mm" in board.text) == (ok, not ok, ok)
 
 
 @pytest.mark.wire
 def test_an_input_without_video_is_told(tried):
     with AxisServer({1: Feed()}) as server:
         server.faults.set("no-video", True)
-        table = {"fixed": {"url": server.url}}
-        fixed = findings(parse_config({"backend": "hardware", "hardware": table}))["hardware.fixed"]
+        fixed = findings(real(fixed={"url": server.url}))["hardware.fixed"]
     assert not fixed.ok
-    assert "has no video on input 1" in fixed.text
+    assert "input 1" in fixed.text
 
 
 @pytest.mark.wire
 def test_a_wrong_password_is_told_with_where_it_belongs(tried, monkeypatch):
     monkeypatch.setenv("COTARGET_PASSWORD", "guessed")
     with AxisServer({1: Feed()}, user="viewer", password="open sesame") as server:
-        table = {"fixed": {"url": server.url, "user": "viewer"}}
-        fixed = findings(parse_config({"backend": "hardware", "hardware": table}))["hardware.fixed"]
-    assert fixed.text.startswith(f"{server.url} refuses the user 'viewer' (401)")
+        fixed = findings(real(fixed={"url": server.url, "user": "viewer"}))["hardware.fixed"]
+    assert server.url in fixed.text
+    assert "'viewer'" in fixed.text
     assert "export COTARGET_PASSWORD" in fixed.fix
     assert "cable" not in fixed.fix

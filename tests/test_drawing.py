@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from cotarget import drawing
-from cotarget.detection import Detection
 from cotarget.drawing import (
     SIZE_KNOWN_S,
     TargetStages,
@@ -17,28 +16,9 @@ from cotarget.drawing import (
     side_by_side,
     write_text,
 )
-from cotarget.estimation.zoom_matching import ZoomMeasurement
 from cotarget.metrics import Row
-from cotarget.pipeline import State, Step
-from cotarget.rig import Frame, PanTiltState, ZoomState
-from cotarget.targeting import Aim
-from cotarget.tracking.track import Track
-
-PICTURE = np.zeros((48, 64, 3), np.uint8)
-MIDDLE = np.array([31.5, 23.5])
-AIM = Aim(0.1, 0.0, 3000.0, 3000.0, False, np.array([1.0, 0.0, 10.0]), 10.0)
-
-
-def step(t, side=8.0, shared=False, off_px=0.0, focal_px=3000.0, seen_s=0.0):
-    """The target's box has a side; it is found off the middle of the zoom view, in that frame or so much earlier."""
-    size = np.full(2, side)
-    box = Detection(np.array([30.0, 20.0]), size, 1.0)
-    track = Track(1, t, True, 0, box.center_px, np.zeros(2), np.full(2, 8.0), 8.0, np.eye(4), 1.0, box, shared)
-    frame, head, lens = Frame(PICTURE, t), PanTiltState(0.1, 0.0, False, t), ZoomState(focal_px, False, t)
-    told = (0.1, 0.0, 3000.0)
-    made = Step(0, t, State.FOLLOWING, "", frame, frame, None, (box,), (track,), track, AIM, told, head, lens)
-    at = ZoomMeasurement(MIDDLE + np.array([off_px, 0.0]), 1.0, np.ones(2), 1.0, 1.0, size, t - seen_s)
-    return dataclasses.replace(made, found=at)
+from cotarget.rig import Frame
+from tests.support.steps import PICTURE, step
 
 
 def staged(steps):
@@ -142,6 +122,24 @@ def test_a_film_shows_both_cameras_equally_high_and_not_too_small_to_be_read(fix
     assert image.shape[1] == sum(height * size[0] // size[1] for size in (fixed, zoom))
     assert (image[height - 1] == 128).all()  # without a reason nothing is written into the images
     assert image.shape[0] > height
+
+
+def test_a_film_shows_the_reason_at_the_foot_of_the_fixed_cameras_image():
+    """In more lines for more words."""
+    bright = np.full((480, 640, 3), 255, np.uint8)
+    plain = dataclasses.replace(step(0.0), fixed=Frame(bright, 0.0), zoom=Frame(bright, 0.0))
+    without = side_by_side(plain, "bird", 0.0).astype(int)
+
+    def rows(reason):
+        """Which rows of the fixed view show anything else."""
+        changed = np.any(side_by_side(dataclasses.replace(plain, reason=reason), "bird", 0.0) != without, axis=2)
+        assert not changed[:, 640:].any()
+        return np.flatnonzero(changed.any(axis=1))
+
+    short, long = rows("zoom: unsure"), rows("the head points 1.3 degrees beside " * 4)
+    assert 440 < short.min() < short.max() < 480
+    assert long.min() < short.min() - 10
+    assert long.max() < 480
 
 
 def row(t, focal_px):

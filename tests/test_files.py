@@ -1,15 +1,16 @@
 """Results: under their name only when complete, written by one run at a time, and through links."""
 
+import fcntl
 import signal
 import subprocess
 import sys
 import threading
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
-from cotarget import files
 from cotarget.drawing import write_picture
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile, PartFile, write_atomically
@@ -57,20 +58,19 @@ def test_what_there_is_can_be_kept_after_an_error_which_says_so(tmp_path, name, 
     assert not hasattr(caught.value, "__notes__")
     with pytest.raises(type(error)) as caught:
         write(path, 3, error, keep=True)
-    assert caught.value.__notes__ == [f"{path} holds what there was until then"]
+    assert [str(path) in note for note in caught.value.__notes__] == [True]
     assert names(tmp_path) == [name]
     if name == "a.csv":
         assert path.read_text().split() == ["n", "0", "1", "2"]
     else:
-        with Film(path) as film:
-            assert len(list(film)) == 3
+        assert len(times_in(path)) == 3
 
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_a_disk_that_is_full_from_the_beginning_leaves_the_old_table(tmp_path, keep):
     path = tmp_path / "a.csv"
     path.write_text("old")
-    with full_disk(), pytest.raises(ConfigError, match=f"a.csv: cannot be written: {SAID}"):
+    with full_disk(), pytest.raises(ConfigError, match=f"a.csv: .*{SAID}"):
         write_table(path, 1, keep=keep)
     assert path.read_text() == "old"
     assert names(tmp_path) == ["a.csv"]
@@ -79,9 +79,9 @@ def test_a_disk_that_is_full_from_the_beginning_leaves_the_old_table(tmp_path, k
 def test_a_table_on_a_disk_that_gets_full_keeps_its_whole_lines(tmp_path):
     """The name of the column and 3 lines of "9\\r\\n" are 12 bytes, and the next is cut."""
     path = tmp_path / "a.csv"
-    with full_disk(14), pytest.raises(ConfigError, match="cannot be written") as caught:
+    with full_disk(14), pytest.raises(ConfigError, match=r"a\.csv: ") as caught:
         write_table(path, 9, keep=True)
-    assert caught.value.__notes__ == [f"{path} holds what there was until then"]
+    assert str(path) in caught.value.__notes__[0]
     assert path.read_text().split() == ["n", "0", "1", "2"]
 
 
@@ -89,7 +89,7 @@ def test_a_film_of_which_the_disk_holds_nothing_is_not_there(tmp_path):
     path = tmp_path / "a.mp4"
     with full_disk(1000), pytest.raises(KeyboardInterrupt) as caught:
         write_film(path, 3, KeyboardInterrupt(), keep=True)
-    assert caught.value.__notes__ == [f"{path} could not be completed"]
+    assert str(path) in caught.value.__notes__[0]
     assert names(tmp_path) == []
 
 
@@ -163,23 +163,46 @@ def test_who_waits_for_a_run_that_goes_on_is_refused(tmp_path, monkeypatch):
     assert (tmp_path / "a.csv").read_text().split() == ["n"]
 
 
+class Signalled:
+    """A film's container; its process gets a signal while the film is completed."""
+
+    def __init__(self, container):
+        self.container, self.number = container, None
+
+    def __getattr__(self, name):
+        return getattr(self.container, name)
+
+    def mux(self, packets):
+        if self.number is not None:
+            signal.raise_signal(self.number)
+        self.container.mux(packets)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_second_signal_while_a_film_is_completed_loses_nothing(tmp_path, number):
+def test_a_second_signal_while_a_film_is_completed_loses_nothing(tmp_path, monkeypatch, number):
     """The first has ended the run; what comes while the file is completed says no more."""
+    containers, plain = [], av.open
+    monkeypatch.setattr(av, "open", lambda *a, **k: containers.append(Signalled(plain(*a, **k))) or containers[-1])
 
     def leave(*_):
         raise KeyboardInterrupt("second")
 
+    def write_and_end():
+        with FilmWriter(tmp_path / "a.mp4", 25.0, keep=True) as film:
+            for index in range(3):
+                film.write(IMAGE, index / 25)
+            containers[0].number = number
+            raise KeyboardInterrupt("first")
+
     former = signal.signal(number, leave)
     try:
         with pytest.raises(KeyboardInterrupt, match="first") as caught:
-            write_and_end(_Signalled(tmp_path / "a.mp4", number), KeyboardInterrupt("first"))
+            write_and_end()
         assert signal.getsignal(number) is leave
     finally:
         signal.signal(number, former)
-    assert caught.value.__notes__ == [f"{tmp_path / 'a.mp4'} holds what there was until then"]
-    with Film(tmp_path / "a.mp4") as film:
-        assert len(list(film)) == 3
+    assert str(tmp_path / "a.mp4") in caught.value.__notes__[0]
+    assert len(times_in(tmp_path / "a.mp4")) == 3
 
 
 @pytest.fixture
@@ -205,39 +228,11 @@ def test_one_who_insists_need_not_wait_for_a_file(tmp_path):
     assert names(tmp_path) == []
 
 
-def write_and_end(writer, error):
-    with writer as film:
-        for number in range(3):
-            film.write(IMAGE, number / 25)
-        raise error
-
-
 def complete(part, signals):
     with part.ending(keep=True):
         for _ in range(signals):
             signal.raise_signal(signal.SIGINT)
         part.path.write_text("whole")
-
-
-class _Signalled(FilmWriter):
-    """Is sent a signal while it is completed."""
-
-    def __init__(self, path, number):
-        super().__init__(path, 25.0, keep=True)
-        self._number = number
-
-    def __exit__(self, *error):
-        plain = self._container
-
-        class Container:
-            def mux(self, packets):
-                signal.raise_signal(number)
-                plain.mux(packets)
-
-            close = plain.close
-
-        number, self._container = self._number, Container()
-        super().__exit__(*error)
 
 
 KILLED = """
@@ -272,14 +267,14 @@ def test_a_result_that_has_just_got_its_name_is_not_taken_for_a_part(tmp_path, m
     first, opened = PartFile(path), []
     first.path.write_text("first")
 
-    def lock(descriptor, plain=files._lock):
+    def flock(descriptor, operation, plain=fcntl.flock):
         if not opened:
             opened.append(descriptor)
             with first.ending(keep=True):
                 pass
-        plain(descriptor)
+        plain(descriptor, operation)
 
-    monkeypatch.setattr("cotarget.files._lock", lock)
+    monkeypatch.setattr(fcntl, "flock", flock)
     second = PartFile(path)
     with pytest.raises(ConfigError, match="another run"):
         PartFile(path)
@@ -313,7 +308,7 @@ def test_a_picture_is_the_old_or_the_new_one(tmp_path):
     path = tmp_path / "a.png"
     write_picture(path, IMAGE)
     old = path.read_bytes()
-    with full_disk(10), pytest.raises(ConfigError, match=f"a.png: cannot be written: {SAID}"):
+    with full_disk(10), pytest.raises(ConfigError, match=f"a.png: .*{SAID}"):
         write_picture(path, np.zeros_like(IMAGE))
     assert path.read_bytes() == old
     assert names(tmp_path) == ["a.png"]

@@ -1,5 +1,7 @@
 """Latencies: of records whose delay is known, and of the simulation, which delays by what its config says."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,10 +10,20 @@ from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import parse_config
 from cotarget.errors import CalibrationError
-from cotarget.latency import command_delay, delay_between, measure_fixed, measure_head, picture_shifts
+from cotarget.latency import (
+    began,
+    command_delay,
+    delay_between,
+    measure_fixed,
+    measure_head,
+    measure_lens,
+    picture_shifts,
+    scales,
+)
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame, PanTiltState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
+from cotarget.sim.world import SimWorld
 
 # The figure asked for is 10 ms; the simulation is measured without a wire in between.
 CLOSE = 0.003  # [s]
@@ -52,6 +64,23 @@ def test_a_command_is_dated_to_where_its_acceleration_begins():
     assert np.isnan(command_delay([(0.0, 0.0, 0.2)], states[:1], 2.0))
 
 
+@pytest.mark.parametrize("stated", [0.5, 0.9, 1.1, 2.0])
+def test_a_motion_that_does_not_fit_the_heads_acceleration_is_no_measurement(stated):
+    """10 turns of 0.2 rad to and fro at 2 rad/s^2, each 0.05 s after its command, and reported every 20 ms."""
+    starts, states = [], []
+    for turn in range(10):
+        t, before, goal = turn, 0.2 * (turn % 2), 0.2 * ((turn + 1) % 2)
+        starts.append((t, before, goal))
+        for since in np.arange(0.0, 0.25, 0.02):
+            gone = max(since - 0.05, 0.0) ** 2
+            states.append(PanTiltState(before + np.sign(goal - before) * gone, 0.0, True, t + since))
+    if 0.8 < stated < 1.2:
+        assert command_delay(starts, states, 2.0 * stated) == pytest.approx(0.05, abs=0.01)
+    else:
+        with pytest.raises(CalibrationError, match=f"{np.degrees(2.0 * stated):.0f} degrees"):
+            command_delay(starts, states, 2.0 * stated)
+
+
 class LateCamera:
     """A camera whose frames claim to be later than they are."""
 
@@ -69,16 +98,19 @@ class LateCamera:
 SMALL = {"fixed": {"rate_hz": 15.0}, "zoom": {"rate_hz": 10.0, "size": [320, 240]}}
 
 
-class Wrapped:
-    def __init__(self, rig, **changed):
-        self.fixed, self.zoom, self.head, self.clock, self.board = rig.fixed, rig.zoom, rig.head, rig.clock, rig.board
-        self.__dict__.update(changed)
+class FrozenCamera(LateCamera):
+    """A camera that gives one image over and over, with new times."""
+
+    def __init__(self, camera):
+        super().__init__(camera, 0.0)
+        self.image = camera.read().image
+
+    def read(self, newer_than=None, timeout=1.0):
+        return Frame(self.image, super().read(newer_than, timeout).t)
 
 
 @pytest.fixture(scope="module")
 def world():
-    from cotarget.sim.world import SimWorld
-
     world = SimWorld(parse_config({"sim": SMALL}))
     yield world
     world.rig.close()
@@ -86,8 +118,6 @@ def world():
 
 @pytest.fixture
 def outdoors():
-    from cotarget.sim.world import SimWorld
-
     world = SimWorld(parse_config({"sim": {**SMALL, "scene": "outdoor"}}))
     yield world
     world.rig.close()
@@ -96,24 +126,15 @@ def outdoors():
 @pytest.mark.render
 @pytest.mark.parametrize("late", [pytest.param(0.0, marks=pytest.mark.slow), 0.045])
 def test_the_zoom_camera_against_the_head(world, late):
-    found = measure_head(Wrapped(world.rig, zoom=LateCamera(world.rig.zoom, late)), seconds=4.0)
+    found = measure_head(replace(world.rig, zoom=LateCamera(world.rig.zoom, late)), seconds=4.0)
     assert found.zoom.seconds == pytest.approx(late, abs=CLOSE)
     assert found.command == pytest.approx(world.config.sim.head.command_delay_s, abs=CLOSE)
 
 
 @pytest.mark.render
 def test_a_picture_that_stands_still_is_no_measurement(world):
-    frame = world.rig.zoom.read()
-
-    class Frozen(LateCamera):
-        def read(self, newer_than=None, timeout=1.0):
-            return Frame(frame.image, super().read(newer_than, timeout).t)
-
-    frozen = Wrapped(world.rig, zoom=Frozen(world.rig.zoom, 0.0))
-    with pytest.raises(
-        CalibrationError, match=r"at pan 0\.0, tilt 0\.0 degrees does not move with the head .* the sky$"
-    ):
-        measure_head(frozen, seconds=4.0)
+    with pytest.raises(CalibrationError, match=r"pan 0\.0, tilt 0\.0 degrees"):
+        measure_head(replace(world.rig, zoom=FrozenCamera(world.rig.zoom)), seconds=4.0)
 
 
 @pytest.mark.render
@@ -150,9 +171,64 @@ def test_the_fixed_camera_against_the_zoom_camera(world):
             HeadGeometry(),
         ),
     )
-    late = Wrapped(world.rig, fixed=LateCamera(world.rig.fixed, 0.03))
+    late = replace(world.rig, fixed=LateCamera(world.rig.fixed, 0.03))
     found, frames = measure_fixed(late, calibration, world.config.board, seconds=4.0)
     assert found.seconds == pytest.approx(0.03, abs=CLOSE)
     assert frames > 40
     with pytest.raises(CalibrationError, match="the fixed camera saw the swinging board in"):
         measure_fixed(late, calibration, world.config.board, seconds=1.0)
+
+
+# The lens
+
+SMALL_LENS = {"size": [320, 240], "rate_hz": 15.0}  # a quarter of the rendering
+LENS_CLOSE = 0.01  # [s], with 15 frames a second
+
+
+def scene():
+    noise = np.random.default_rng(0).uniform(0, 255, (240, 320, 3)).astype(np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 3)
+
+
+def test_a_picture_that_grows_tells_its_scale():
+    wanted = np.array([0.0, 0.0, 0.06, 0.12, 0.12, 0.02])
+    pictures = [cv2.warpAffine(scene(), cv2.getRotationMatrix2D((160, 120), 0, np.exp(s)), (320, 240)) for s in wanted]
+    np.testing.assert_allclose(scales(pictures), wanted, atol=0.003)
+
+
+def test_a_picture_without_structure_tells_nothing():
+    assert np.isnan(scales([np.full((60, 80, 3), 128, np.uint8)] * 3)[1:]).all()
+
+
+@pytest.mark.parametrize("began_at", [0.5, 0.52, 0.569])
+def test_an_even_way_began_where_it_leads_back_to(began_at):
+    times = np.arange(0.0, 1.5, 0.07)
+    assert began(times, np.clip((times - began_at) / 0.4, 0.0, 1.0)) == pytest.approx(began_at, abs=1e-6)
+
+
+def test_a_way_between_two_frames_began_between_them():
+    assert began(np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.0, 0.0, 1.0, 1.0])) == pytest.approx(0.15)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("late", [pytest.param(0.0, marks=pytest.mark.slow), 0.045])
+def test_the_simulated_lens(late):
+    config = parse_config({"sim": {"zoom": SMALL_LENS, "head": {"command_delay_s": 0.12}}})
+    with SimWorld(config).rig as rig:
+        found = measure_lens(replace(rig, zoom=LateCamera(rig.zoom, late)), late)
+        assert found.command == pytest.approx(0.12, abs=LENS_CLOSE)
+        assert found.spread < LENS_CLOSE
+        assert rig.zoom.state().focal_px == pytest.approx(rig.zoom.focal_range[0])
+
+
+@pytest.mark.render
+def test_a_picture_that_does_not_grow_is_no_measurement():
+    world = SimWorld(parse_config({"sim": {"zoom": SMALL_LENS}}))
+    with world.rig as rig, pytest.raises(CalibrationError, match=r"1\.00 times"):
+        measure_lens(replace(rig, zoom=FrozenCamera(rig.zoom)))
+
+
+def test_a_lens_that_hardly_zooms_is_told():
+    config = parse_config({"sim": {"zoom": {"focal_mm": [6.0, 6.3]}, "effects": {"optics": False}}})
+    with SimWorld(config, rendered=()).rig as rig, pytest.raises(CalibrationError, match=r"zooms by 1\.05 times"):
+        measure_lens(rig)

@@ -189,96 +189,77 @@ def test_an_own_detector_is_found_beside_rig_toml(rig, monkeypatch):
         detector.detect(Frame(np.zeros((48, 64, 3), np.uint8), 0.0))
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ('"devices:Camera"', ""),
-        (
-            '"devices:Camera"\ncolor = "red"',
-            "unknown key 'hardware.fixed.color'; valid here: colour, driver, rate_hz, ",
-        ),
-        ('"devices:Camera"\nrate_hz = "9"', "hardware.fixed.rate_hz: '9' is not a finite number"),
-        ('"device:Camera"', "hardware.fixed.driver: there is no module 'device' beside rig.toml or on Python's path"),
-        (
-            '"devices:Camer"',  # what the file imports is no driver of it
-            "hardware.fixed.driver: {folder}/devices.py has no 'Camer'; it has: Broken, Camera, CameraSettings, Head, ",
-        ),
-        (
-            '"devices:Unset"',
-            "hardware.fixed.driver: {folder}/devices.py:Unset has no Settings, a dataclass of its keys",
-        ),
-        ('"devices:Wrong"', "hardware.fixed.driver: spec of its Settings is no CameraSpec of cotarget.rig"),
-        ('"devices"', "hardware.fixed.driver: 'devices' is neither module:name nor one of: axis"),
-        ('"syntax:Camera"', "hardware.fixed.driver: {folder}/syntax.py:2: SyntaxError"),
-        ('"failing:Camera"', "hardware.fixed.driver: {folder}/failing.py:3: ZeroDivisionError: division by zero"),
-        ('"needs:Camera"', "hardware.fixed.driver: {folder}/needs.py:1: ModuleNotFoundError: No module named 'no_such"),
-    ],
-)
+@pytest.mark.parametrize(("change", "said"), [
+    ('"devices:Camera"\ncolor = "red"', "unknown key 'hardware.fixed.color'; valid here: colour, driver, rate_hz, "),
+    ('"devices:Camera"\nrate_hz = "9"', "hardware.fixed.rate_hz: '9'"),
+    ('"device:Camera"', "hardware.fixed.driver: there is no module 'device'"),
+    # What the file imports is no driver of it.
+    ('"devices:Camer"', "hardware.fixed.driver: {folder}/devices.py has no 'Camer'; it has: Broken, Camera, CameraSet"),
+    ('"devices:Unset"', "hardware.fixed.driver: {folder}/devices.py:Unset has no Settings"),
+    ('"devices:Wrong"', "hardware.fixed.driver: spec of its Settings is no CameraSpec"),
+    ('"devices"', "hardware.fixed.driver: 'devices' is neither module:name nor one of: axis"),
+    ('"syntax:Camera"', "hardware.fixed.driver: {folder}/syntax.py:2: SyntaxError"),
+    ('"failing:Camera"', "hardware.fixed.driver: {folder}/failing.py:3: ZeroDivisionError"),
+    ('"needs:Camera"', "hardware.fixed.driver: {folder}/needs.py:1: ModuleNotFoundError: No module named 'no_such"),
+])  # fmt: skip
 def test_each_mistake_is_one_line_that_names_it(rig, change, said):
     (rig.parent / "syntax.py").write_text("x = 1\nclass Camera(:\n")
     (rig.parent / "failing.py").write_text("x = 1\n\n1 / 0\n")
     (rig.parent / "needs.py").write_text("import no_such_library\n")
     rig.write_text(RIG.replace('"devices:Camera"\ncolour = "green"', change))
-    if not said:
-        load_config(rig)
-        return
     with pytest.raises(ConfigError) as caught:
         load_config(rig)
     assert str(caught.value).startswith(f"{rig}: {said.format(folder=rig.parent)}")
     assert "\n" not in str(caught.value)
 
 
-def test_an_error_of_a_device_is_one_line_that_names_file_and_line(rig):
-    rig.write_text(RIG.replace("devices:Camera", "devices:Broken"))
-    with pytest.raises(DeviceError, match=r"^hardware\.fixed: .*devices\.py:\d+: RuntimeError: the lens cap is on$"):
-        open_rig(rig)
-    rig.write_text(RIG.replace("devices:Camera", "devices:Short"))
-    with pytest.raises(ConfigError, match=r"^hardware\.fixed\.driver: Short has no read; docs/drivers\.md says what"):
-        open_rig(rig)
-    rig.write_text(RIG.replace("devices:Head", "devices:Limitless"))
-    with pytest.raises(DeviceError, match=r"^hardware\.head: .*devices\.py:\d+: ZeroDivisionError: "):
-        open_rig(rig)
-    rig.write_text(RIG.replace('"green"', '"pink"'))
-    with open_rig(rig) as opened, pytest.raises(DeviceError, match=r"^hardware\.fixed: .*devices\.py:\d+: KeyError"):
+@pytest.mark.parametrize(("wrong", "error", "said"), [
+    (("devices:Camera", "devices:Broken"), DeviceError, r"hardware\.fixed: .*devices\.py:\d+: RuntimeError: the lens "),
+    (("devices:Camera", "devices:Short"), ConfigError, r"hardware\.fixed\.driver: Short has no read; docs/drivers\.md"),
+    (("devices:Head", "devices:Limitless"), DeviceError, r"hardware\.head: .*devices\.py:\d+: ZeroDivisionError: "),
+    (('"green"', '"pink"'), DeviceError, r"hardware\.fixed: .*devices\.py:\d+: KeyError"),
+])  # fmt: skip
+def test_an_error_of_a_device_is_one_line_that_names_file_and_line(rig, wrong, error, said):
+    rig.write_text(RIG.replace(*wrong))
+    with pytest.raises(error, match=f"^{said}"), open_rig(rig) as opened:
         opened.fixed.read()
 
 
-@pytest.mark.parametrize(("method", "answer", "said"), [
-    ("head.state", "(0.1, 0.2)", "hardware.head: state returned (0.1, 0.2); it has to return a PanTiltState"),
-    ("head.move", "None", "hardware.head: move returned None; it has to return pan and tilt as commanded [rad]"),
-    ("zoom.state", "100.0", "hardware.zoom: state returned 100.0; it has to return a ZoomState"),
-    ("zoom.zoom", "None", "hardware.zoom: zoom returned None; it has to return the focal length that the lens will "),
-    ("zoom.capture", "np.zeros((48, 64, 3), np.uint8)", "hardware.zoom: capture returned a ndarray; it has to return "),
-    ("fixed.read", "Frame(np.zeros((48, 64), np.uint8), 0.0)", "hardware.fixed: read returned a Frame; it has to "),
-    ("fixed.read", "Frame(np.zeros((48, 64, 3)), 0.0)", "hardware.fixed: read returned a Frame; it has to return a "),
-])  # fmt: skip
-def test_an_answer_of_another_kind_is_one_line_that_names_device_and_method(rig, method, answer, said):
-    device, name = method.split(".")
-    kind = {"head": "Head", "zoom": "Zoom", "fixed": "Camera"}[device]
-    other = f"\n\nclass Other({kind}):\n    def {name}(self, *a, **k):\n        return {answer}\n"
-    (rig.parent / "devices.py").write_text(DEVICES + other)
+KINDS = {"head": "Head", "zoom": "Zoom", "fixed": "Camera"}
+
+
+def with_other(rig, device, body):
+    """Let a device be another one, which differs from the usual by a body of its class."""
+    kind = KINDS[device]
+    (rig.parent / "devices.py").write_text(f"{DEVICES}\n\nclass Other({kind}):\n{body}")
     rig.write_text(RIG.replace(f'"devices:{kind}"', '"devices:Other"'))
-    arguments = {"head.move": (0.1, 0.2), "zoom.zoom": (200.0,)}.get(method, ())
+
+
+@pytest.mark.parametrize(("device", "method", "answer", "wanted"), [
+    ("head", "state", "(0.1, 0.2)", "a PanTiltState"),
+    ("head", "move", "None", "pan and tilt as commanded [rad]"),
+    ("zoom", "state", "100.0", "a ZoomState"),
+    ("zoom", "zoom", "None", "the focal length that the lens will "),
+    ("zoom", "capture", "np.zeros((48, 64, 3), np.uint8)", ""),
+    ("fixed", "read", "Frame(np.zeros((48, 64), np.uint8), 0.0)", ""),
+    ("fixed", "read", "Frame(np.zeros((48, 64, 3)), 0.0)", ""),
+])  # fmt: skip
+def test_an_answer_of_another_kind_is_one_line_that_names_device_and_method(rig, device, method, answer, wanted):
+    with_other(rig, device, f"    def {method}(self, *a, **k):\n        return {answer}\n")
+    arguments = {"move": (0.1, 0.2), "zoom": (200.0,)}.get(method, ())
     with pytest.raises(DeviceError) as caught, open_rig(rig) as opened:
-        getattr(getattr(opened, device), name)(*arguments)
-    assert str(caught.value).startswith(said)
+        getattr(getattr(opened, device), method)(*arguments)
+    assert str(caught.value).startswith(f"hardware.{device}: {method} returned ")
+    assert f"it has to return {wanted}" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("attribute", "wrong", "said"), [
-    ("head.limits", "((-1.0, 1.0), (-0.5, 0.5))", "limits is ((-1.0, 1.0), (-0.5, 0.5)); it has to be a PanTiltLimits"),
-    ("fixed.size", "None", "size is None; it has to be (width, height) [px], a tuple of two whole numbers above zero"),
-    ("fixed.size", "[64, 48]", "size is [64, 48]; it has to be (width, height)"),
-    ("zoom.size", "(64.0, 48.0)", "size is (64.0, 48.0); it has to be (width, height)"),
-    ("zoom.still_size", "(0, 48)", "still_size is (0, 48); it has to be (width, height)"),
-    ("zoom.focal_range", "(400.0, 100.0)", "focal_range is (400.0, 100.0); it has to be (shortest, longest) focal "),
+@pytest.mark.parametrize(("device", "name", "wrong"), [
+    ("head", "limits", "((-1.0, 1.0), (-0.5, 0.5))"), ("fixed", "size", "None"), ("fixed", "size", "[64, 48]"),
+    ("zoom", "size", "(64.0, 48.0)"), ("zoom", "still_size", "(0, 48)"), ("zoom", "focal_range", "(400.0, 100.0)"),
 ])  # fmt: skip
-def test_an_attribute_of_another_kind_is_one_line_and_the_device_is_closed(rig, attribute, wrong, said):
-    device, name = attribute.split(".")
-    kind = {"head": "Head", "zoom": "Zoom", "fixed": "Camera"}[device]
-    other = f"""
-
-class Other({kind}):
+def test_an_attribute_of_another_kind_is_one_line_and_the_device_is_closed(rig, device, name, wrong):
+    body = f"""
     def __setattr__(self, name, value):
         if name != {name!r}:
             super().__setattr__(name, value)
@@ -290,11 +271,10 @@ class Other({kind}):
     def close(self):
         open({str(rig.parent / "closed")!r}, "w").close()
 """
-    (rig.parent / "devices.py").write_text(DEVICES + other)
-    rig.write_text(RIG.replace(f'"devices:{kind}"', '"devices:Other"'))
+    with_other(rig, device, body)
     with pytest.raises(DeviceError) as caught:
         open_rig(rig)
-    assert str(caught.value).startswith(f"hardware.{device}: {said}")
+    assert str(caught.value).startswith(f"hardware.{device}: {name} is {wrong}; it has to be ")
     assert "\n" not in str(caught.value)
     assert (rig.parent / "closed").exists()
 

@@ -16,19 +16,10 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.detect_video import COLUMNS, run_on_film
 from cotarget.errors import CotargetError
 from cotarget.video import Film, FilmWriter
+from tests.support.commands import FILM_HZ as RATE
+from tests.support.commands import bird_film
 
-RATE = 25.0
 BIRD = DEFAULT_TARGETS["bird"]
-
-
-def bird_film(path, count=60, size=(161, 121)):
-    """A dark 12 x 6 px bird that crosses a bright sky at 50 px/s; an odd size on purpose."""
-    with FilmWriter(path, RATE) as film:
-        for i in range(count):
-            image = np.full((size[1], size[0], 3), (220, 190, 160), np.uint8)
-            u = 10 + 2 * i
-            image[50:56, u - 6 : u + 6] = 30
-            film.write(image, i / RATE)
 
 
 def test_a_film_is_h264_yuv420p_and_reads_back(tmp_path):
@@ -37,6 +28,7 @@ def test_a_film_is_h264_yuv420p_and_reads_back(tmp_path):
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert "creation_time" not in container.metadata  # nobody said what the time of day was
     with Film(path) as film:
         frames = list(film)
         assert film.size == (162, 122)
@@ -67,27 +59,6 @@ def test_frames_are_shown_at_their_own_times(tmp_path, suffix):
         assert container.duration == pytest.approx(1e6 * (shown[-1] + 1 / RATE), abs=2e3)
 
 
-def test_a_film_of_no_time_of_day_says_none(tmp_path):
-    bird_film(tmp_path / "a.mp4", 2)
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        assert "creation_time" not in container.metadata
-
-
-def test_a_film_that_failed_leaves_the_old_one(tmp_path):
-    path = tmp_path / "a.mp4"
-    path.write_bytes(b"old")
-
-    def fail():
-        with FilmWriter(path, RATE) as film:
-            film.write(np.zeros((20, 20, 3), np.uint8), 0.0)
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        fail()
-    assert path.read_bytes() == b"old"
-    assert len(list(tmp_path.iterdir())) == 1
-
-
 def test_films_that_cannot_be_read_name_the_file(tmp_path):
     text, sound, cut = tmp_path / "text.mp4", tmp_path / "sound.wav", tmp_path / "cut.mp4"
     text.write_text("no film")
@@ -98,16 +69,9 @@ def test_films_that_cannot_be_read_name_the_file(tmp_path):
         out.mux(stream.encode(block))
     bird_film(tmp_path / "whole.mp4", 10)
     cut.write_bytes((tmp_path / "whole.mp4").read_bytes()[:300])
-    for path, said in [
-        (tmp_path / "none.mp4", "no such file"),
-        (tmp_path, "directory"),
-        (text, "cannot be read as a film"),
-        (sound, "no video stream"),
-        (cut, "cannot be read as a film"),
-    ]:
-        with pytest.raises(CotargetError, match=said) as caught:
+    for path in (tmp_path / "none.mp4", tmp_path, text, sound, cut):
+        with pytest.raises(CotargetError, match=f"^{re.escape(str(path))}: ") as caught:
             run_on_film(path, BIRD, tmp_path / "out.csv")
-        assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
     assert not (tmp_path / "out.csv").exists()
 
@@ -306,7 +270,7 @@ def test_run_on_film(tmp_path):
     film, table, drawn = tmp_path / "a.mp4", tmp_path / "a.csv", tmp_path / "drawn.mp4"
     bird_film(film)
     told = []
-    summary = run_on_film(film, BIRD, table, drawn, lambda done, total: told.append((done, total)))
+    summary = run_on_film(film, BIRD, table, drawn, lambda *given: told.append(given[:2]))
     assert told == [(i, 60) for i in range(1, 61)]
     with table.open() as file:
         rows = list(csv.DictReader(file))
@@ -338,7 +302,7 @@ def test_a_failing_run_keeps_the_old_table(tmp_path):
         run_on_film(tmp_path / "none.mp4", BIRD, table)
     bird_film(tmp_path / "a.mp4", 5)
 
-    def fail(done, total):
+    def fail(*_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -347,5 +311,5 @@ def test_a_failing_run_keeps_the_old_table(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "a.mp4"]
     with pytest.raises(CotargetError, match="is the film itself"):
         run_on_film(tmp_path / "a.mp4", BIRD, tmp_path / "a.mp4")
-    with pytest.raises(CotargetError, match="folder"):
+    with pytest.raises(CotargetError, match=r"nowhere.a\.csv"):
         run_on_film(tmp_path / "a.mp4", BIRD, tmp_path / "nowhere" / "a.csv")

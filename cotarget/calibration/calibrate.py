@@ -40,7 +40,6 @@ from cotarget.calibration.model import (
     CameraName,
     Capture,
     Options,
-    Progress,
     Rejected,
     View,
     unseen,
@@ -57,6 +56,7 @@ from cotarget.calibration.session import (
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array
+from cotarget.parallel import Progress
 from cotarget.rig import Rig, opened_from
 
 log = logging.getLogger(__name__)

@@ -1,6 +1,6 @@
 """Data of a calibration: captures, views, options, the model of a fit, residuals and covariance."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
@@ -17,7 +17,6 @@ from cotarget.schema import NotNegative, model
 
 CameraName = Literal["fixed", "zoom"]
 Count = Annotated[int, Ge(0)]
-Progress = Callable[[int, int, str], None]  # done, total, text
 
 
 @dataclass(frozen=True)

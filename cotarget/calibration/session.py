@@ -51,7 +51,7 @@ from cotarget.calibration.joint import (
     spread_stops,
     with_stop,
 )
-from cotarget.calibration.model import BundleModel, Capture, Progress, Rejected, View, unseen
+from cotarget.calibration.model import BundleModel, Capture, Rejected, View, unseen
 from cotarget.calibration.planning import (
     Coverage,
     PredictedAccuracy,
@@ -70,6 +70,7 @@ from cotarget.config import BoardConfig, RigConfig
 from cotarget.errors import CalibrationError, ConfigError, CotargetError, HaltedError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, Rotation, pose_dict
 from cotarget.pantilt import base_head, solve
+from cotarget.parallel import Progress
 from cotarget.rig import (
     Clock,
     Frame,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
-    check_board_is_told,
+    check_board_size,
     check_outputs,
     load_plausible,
     open_named,
@@ -31,7 +31,7 @@ LISTS = ("index.json", "session.json", "commands.jsonl")  # files beside the ima
 SESSION = ("placements", "stops")  # options of a capture session
 
 
-def calibrate(options: argparse.Namespace) -> None:
+def calibrate_command(options: argparse.Namespace) -> None:
     """Run `cotarget calibrate`: calibrate from a capture session, saved captures or photos, and print a summary."""
     from cotarget import calibration as cal
     from cotarget.backends import load_config
@@ -50,28 +50,30 @@ def calibrate(options: argparse.Namespace) -> None:
     _check_together(options)
     check_writable(options.out)
     how = cal.Options(options.method, encoders=options.encoders, regularize=options.insist)
-    with _captures_kept(options.captures), progress_bar() as progress:
+    with _captures_kept(options.captures), progress_bar() as bar:
 
-        def tell(done: int, total: int, text: str) -> None:
-            progress(f"calibrating: {text}", done, total)
+        def progress(done: float, total: float | None, text: str) -> None:
+            bar(done, total, f"calibrating: {text}")
 
         if config is not None:
             refuse_if_stopped(config.safety.stop_file)
-            check_board_is_told(options.rig, config)
+            check_board_size(options.rig, config)
             with open_named(options.rig, config) as rig:
                 found = calibrate_rig(
                     rig,
                     captures_dir=options.captures,
-                    progress=tell,
+                    progress=progress,
                     seed=config.sim.seed,
                     options=how,
                     **{name: getattr(options, name) for name in _given(options, SESSION)},
                 )
         elif options.board is not None:
             board = BoardConfig(options.kind or "chessboard", options.board, options.square)
-            found = cal.calibrate_photos(options.source, options.fixed, options.zoom, board, options=how, progress=tell)
+            found = cal.calibrate_photos(
+                options.source, options.fixed, options.zoom, board, options=how, progress=progress
+            )
         else:
-            found = cal.calibrate_captures(options.source, options=how, progress=tell)
+            found = cal.calibrate_captures(options.source, options=how, progress=progress)
         with previous_kept(options.out):
             cal.save_calibration(options.out, found)
     _print_result(found, options.out)
@@ -84,11 +86,11 @@ def _print_result(found: "Calibration", path: Path) -> None:
     if left_out := len(residuals.rejected):
         images = left_out + residuals.fixed_views + residuals.zoom_views
         print(f"not used: {left_out} of {images} images; {path} has the reasons (residuals.rejected)", file=sys.stderr)
-    told = summary(found, path)
+    table = calibration_summary(found, path)
     if sys.stdout.isatty():
-        print(f"{path}: {told['verdict']}")
+        print(f"{path}: {table['verdict']}")
     else:
-        print_json(told)
+        print_json(table)
 
 
 def _lists(directory: Path | None) -> list[Path]:
@@ -161,7 +163,7 @@ def _check_together(options: argparse.Namespace) -> None:
         )
 
 
-def summary(found: "Calibration", path: Path) -> dict[str, Any]:
+def calibration_summary(found: "Calibration", path: Path) -> dict[str, Any]:
     """Build the output of calibrate: residuals, pointing accuracy and verdict."""
     import numpy as np
 
@@ -170,7 +172,7 @@ def summary(found: "Calibration", path: Path) -> dict[str, Any]:
 
     assert found.residuals is not None
     residuals = {k: v for k, v in dataclasses.asdict(found.residuals).items() if k != "rejected"}
-    told = residuals | {
+    table = residuals | {
         "rejected": len(found.residuals.rejected),
         "baseline_m": float(np.linalg.norm(found.zoom_head.T_zoom0_fixed.translation)),
         "head_jitter_deg": math.degrees(found.jitter),
@@ -178,16 +180,16 @@ def summary(found: "Calibration", path: Path) -> dict[str, Any]:
     }
     if can_point(found):
         at = pointing(found)
-        told |= {
+        table |= {
             "predicted_error_deg": {f"{one.nominal_px:.0f} px": math.degrees(one.rms) for one in at},
             f"predicted_error_deg_with_{MORE_PLACEMENTS}_more_placements": {
                 f"{one.nominal_px:.0f} px": math.degrees(with_more_placements(found, one)) for one in at
             },
         }
-    return told | {"verdict": judge(found).text, "calibration": str(path)}
+    return table | {"verdict": judge(found).text, "calibration": str(path)}
 
 
-def report(options: argparse.Namespace) -> None:
+def report_command(options: argparse.Namespace) -> None:
     """Run `cotarget report`: write the report page of a calibration."""
     from cotarget.report.page import write_report
 
@@ -198,7 +200,7 @@ def report(options: argparse.Namespace) -> None:
     print(f"the page is {page}, and its pictures are in {page.stem}_pictures beside it")
 
 
-def board(options: argparse.Namespace) -> None:
+def board_command(options: argparse.Namespace) -> None:
     """Run `cotarget board`: write a board to print."""
     from cotarget.board import check_board, print_board
     from cotarget.config import BoardConfig, check_square

@@ -15,18 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
-from cotarget.cli import calibrating, operating, running
-from cotarget.cli.common import (
-    add_insist,
-    add_selection,
-    corners,
-    count,
-    duration,
-    not_negative,
-    number,
-    port,
-    positive,
-)
+from cotarget.cli import calibrating, following, operating, running
+from cotarget.cli.common import add_insist, board_corners, duration, not_negative, number, port, positive, positive_int
+from cotarget.cli.following import add_selection
 from cotarget.errors import CotargetError
 
 USAGE = 2  # argparse's own exit status
@@ -78,7 +69,7 @@ ONE_THREAD = ("OMP_NUM_THREADS", "1")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit status."""
     os.environ.setdefault(*ONE_THREAD)
-    parser = _parser()
+    parser = make_parser()
     options = parser.parse_args(arguments)
     # SIGTERM and SIGHUP raise SystemExit, so that the rig halts and files are completed, as on Ctrl-C.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
@@ -92,7 +83,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except CotargetError as error:
-        _say(options.command, str(error), error)
+        text = str(error)
+        if getattr(options, "rig", None) is not None:  # whose name the safety layer does not know
+            text = text.replace("--rig FILE", f"--rig {options.rig}")
+        _say(options.command, text, error)
         return 1
     except BrokenPipeError:
         return 1
@@ -131,7 +125,19 @@ def _notes(end: BaseException) -> list[str]:
 DESCRIPTION = "A fixed camera finds a small target; a zoom camera on a pan-tilt head shows it large."
 
 
-def _parser() -> argparse.ArgumentParser:
+FOLLOW_STATUSES = (
+    "exit status: 0 the target was followed; 1 an error; 2 a wrong option; 3 the zoom camera mostly did not show the "
+    "target; 4 no target was followed; 130 Ctrl-C ended a run with --seconds"
+)
+
+
+def file_option(parser: argparse.ArgumentParser, name: str, about: str, metavar: str = "FILE", **more: Any) -> None:
+    """Add an option or argument that names a file or folder."""
+    parser.add_argument(name, type=Path, metavar=metavar, help=about, **more)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line, with a parser for each command."""
     parser = Parser(prog="cotarget", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"cotarget {version('cotarget')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=CommandParser)
@@ -142,40 +148,39 @@ def _parser() -> argparse.ArgumentParser:
         made.set_defaults(run=run)
         return made
 
-    demo = command("demo", running.demo, "calibrate a simulated rig and follow a book, a person and a bird")
-    demo.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="where to write (demo-out)")
+    def outputs(made: Parser) -> None:
+        file_option(made, "--csv", "write one line a step; -: to stdout")
+        file_option(made, "--video", "write a side-by-side video (.mp4)")
+
+    demo = command("demo", running.demo_command, "calibrate a simulated rig and follow a book, a person and a bird")
+    file_option(demo, "--out", "where to write (demo-out)", "DIR", default=Path("demo-out"))
     demo.add_argument("--seed", type=not_negative, default=0, help="seed of everything random (0)")
 
     calibrate = command(
-        "calibrate", calibrating.calibrate, "calibrate from a rig, from saved captures, or from plain photos"
+        "calibrate", calibrating.calibrate_command, "calibrate from a rig, from saved captures, or from plain photos"
     )
     source = calibrate.add_mutually_exclusive_group(required=True)
     source.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml: drive that rig through a capture plan")
     source.add_argument("--from", type=Path, metavar="DIR", dest="source", help="captures taken earlier, or photos")
-    calibrate.add_argument(
-        "--out",
-        type=Path,
-        default=Path("calibration.json"),
-        metavar="FILE",
-        help="file to write (calibration.json); an earlier one is kept under another name",
-    )
-    calibrate.add_argument("--captures", type=Path, metavar="DIR", help="with --rig: keep the images in this folder")
+    about = "file to write (calibration.json); an earlier one is kept under another name"
+    file_option(calibrate, "--out", about, default=Path("calibration.json"))
+    file_option(calibrate, "--captures", "with --rig: keep the images in this folder", "DIR")
     calibrate.add_argument("--fixed", metavar="GLOB", help="photos of the fixed camera, such as 'left*.jpg'")
     calibrate.add_argument(
         "--zoom", metavar="GLOB", help="photos of the zoom camera, paired by the numbers in their names"
     )
-    calibrate.add_argument("--board", type=corners, metavar="CxR", help="inner corners of the board, such as 9x6")
+    calibrate.add_argument("--board", type=board_corners, metavar="CxR", help="inner corners of the board, such as 9x6")
     calibrate.add_argument("--square", type=positive, metavar="M", help="side of a square [m]")
     calibrate.add_argument("--kind", choices=KINDS, help=f"kind of the board on photos ({KINDS[0]})")
     calibrate.add_argument(
         "--placements",
-        type=count,
+        type=positive_int,
         metavar="N",
         help="with --rig: number of board placements at the shortest focal length, at least 7 (30)",
     )
     calibrate.add_argument(
         "--stops",
-        type=count,
+        type=positive_int,
         metavar="N",
         help="with --rig: number of zoom samples, more where they are too far apart; 1: shortest alone, otherwise with "
         "6 more placements far away (8)",
@@ -193,20 +198,14 @@ def _parser() -> argparse.ArgumentParser:
         help="go on where the motions leave something undetermined, with an uncertainty to match",
     )
 
-    report = command("report", calibrating.report, "write a page on how far a calibration can be trusted")
-    report.add_argument("calibration", type=Path, metavar="FILE", help="calibration.json")
-    report.add_argument(
-        "--out", type=Path, default=Path("report.html"), metavar="PAGE", help="file to write (report.html)"
-    )
-
+    report = command("report", calibrating.report_command, "write a page on how far a calibration can be trusted")
+    file_option(report, "calibration", "calibration.json")
+    file_option(report, "--out", "file to write (report.html)", "PAGE", default=Path("report.html"))
     add_insist(report)
 
-    aim = command(
-        "aim",
-        operating.aim,
-        "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout",
-    )
-    aim.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
+    about = "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout"
+    aim = command("aim", operating.aim_command, about)
+    file_option(aim, "--calibration", "calibration.json", required=True)
     aim.add_argument("--pixel", type=float, nargs=2, required=True, metavar=("U", "V"), help="pixel of the fixed image")
     how_far = aim.add_mutually_exclusive_group(required=True)
     how_far.add_argument("--depth", type=positive, metavar="M", help="depth along the fixed camera's axis [m]")
@@ -217,7 +216,7 @@ def _parser() -> argparse.ArgumentParser:
     how_close = aim.add_mutually_exclusive_group()
     how_close.add_argument("--wanted-px", type=positive, metavar="N", help="wanted size in the close-up [px]")
     how_close.add_argument("--focal-mm", type=positive, metavar="F", help="focal length to use [mm]")
-    aim.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for limits and targets (the default rig)")
+    file_option(aim, "--rig", "rig.toml, for limits and targets (the default rig)")
     aim.add_argument(
         "--ik",
         choices=("exact", "paper-table", "paper-example"),
@@ -226,143 +225,104 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_insist(aim)
 
-    follow = command("follow", running.follow, "follow a target with a calibrated rig")
-    follow.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
-    follow.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
+    follow = command("follow", following.follow_command, "follow a target with a calibrated rig")
+    file_option(follow, "--rig", "rig.toml", required=True)
+    file_option(follow, "--calibration", "calibration.json", required=True)
     follow.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
     add_selection(follow)
     follow.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
-    follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step; -: to stdout")
-    follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
-    follow.add_argument("--record", type=Path, metavar="DIR", help="record everything, for cotarget replay")
+    outputs(follow)
+    file_option(follow, "--record", "record everything, for cotarget replay", "DIR")
     add_insist(follow)
+    follow.more = lambda: FOLLOW_STATUSES
 
-    replay = command("replay", running.replay, "run the pipeline again on a recording of follow --record")
-    replay.add_argument("recording", type=Path, metavar="DIR", help="folder of the recording")
+    replay = command("replay", following.replay_command, "run the pipeline again on a recording of follow --record")
+    file_option(replay, "recording", "folder of the recording", "DIR")
     add_selection(replay, "as in the recorded run")
-    replay.add_argument(
-        "--check",
-        action="store_true",
-        help="end with status 1 if the commands differ from the recorded ones",
-    )
-    replay.add_argument(
-        "--labels",
-        type=Path,
-        metavar="FILE",
-        help="score the tracks by these labels: a csv as for detect, whose frame is the image number in DIR/fixed",
-    )
-    replay.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step; -: to stdout")
-    replay.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
+    about = "end with status 1 if the commands differ from the recorded ones"
+    replay.add_argument("--check", action="store_true", help=about)
+    about = "score the tracks by these labels: a csv as for detect, whose frame is the image number in DIR/fixed"
+    file_option(replay, "--labels", about)
+    outputs(replay)
 
-    point = command("point", operating.point, "move head and lens to given values, and take a picture with each camera")
-    point.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
+    about = "move head and lens to given values, and take a picture with each camera"
+    point = command("point", operating.point_command, about)
+    file_option(point, "--rig", "rig.toml", required=True)
     point.add_argument("--pan-deg", type=number, metavar="A", help="pan, positive to the right (unchanged)")
     point.add_argument("--tilt-deg", type=number, metavar="A", help="tilt, positive up (unchanged)")
     point.add_argument("--focal-mm", type=positive, metavar="F", help="focal length [mm] (unchanged)")
-    point.add_argument(
-        "--pictures",
-        type=Path,
-        metavar="DIR",
-        help="write fixed.png and zoom.png to this folder; earlier ones are kept under other names",
-    )
+    about = "write fixed.png and zoom.png to this folder; earlier ones are kept under other names"
+    file_option(point, "--pictures", about, "DIR")
 
-    latency = command(
-        "latency", operating.latency, "measure the latencies and command delays of cameras, head and lens"
-    )
-    latency.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
-    latency.add_argument(
-        "--calibration",
-        type=Path,
-        metavar="FILE",
-        help="calibration.json; measures the fixed camera too, by a board that is swung",
-    )
+    about = "measure the latencies and command delays of cameras, head and lens"
+    latency = command("latency", operating.latency_command, about)
+    file_option(latency, "--rig", "rig.toml", required=True)
+    about = "calibration.json; measures the fixed camera too, by a board that is swung"
+    file_option(latency, "--calibration", about)
     add_insist(latency)
 
-    stop = command("stop", operating.stop, "emergency stop of every rig that watches this rig.toml's stop file")
-    stop.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
-    stop.add_argument(
-        "--reason",
-        default="stopped by the operator",
-        metavar="TEXT",
-        help="reason, which every stopped program reports",
-    )
+    about = "emergency stop of every rig that watches this rig.toml's stop file"
+    stop = command("stop", operating.stop_command, about)
+    file_option(stop, "--rig", "rig.toml", required=True)
+    about = "reason, which every stopped program reports"
+    stop.add_argument("--reason", default="stopped by the operator", metavar="TEXT", help=about)
 
-    clear = command("clear", operating.clear, "end an emergency stop, when it is safe to move")
-    clear.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
+    clear = command("clear", operating.clear_command, "end an emergency stop, when it is safe to move")
+    file_option(clear, "--rig", "rig.toml", required=True)
 
-    reset_head = command(
-        "reset-head", operating.reset_head, "let the pan-tilt head find its limits; it turns through its whole range"
-    )
-    reset_head.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
+    about = "let the pan-tilt head find its limits; it turns through its whole range"
+    reset_head = command("reset-head", operating.reset_head_command, about)
+    file_option(reset_head, "--rig", "rig.toml", required=True)
     reset_head.add_argument("--yes", action="store_true", help="confirm that camera and cables are clear of it")
 
-    emulate = command(
-        "emulate", operating.emulate, "put a simulated rig behind the real devices' protocols, in real time"
-    )
-    emulate.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
-    emulate.add_argument(
-        "--write", type=Path, required=True, metavar="FILE", help="rig.toml to write, which connects to it"
-    )
+    about = "put a simulated rig behind the real devices' protocols, in real time"
+    emulate = command("emulate", operating.emulate_command, about)
+    file_option(emulate, "--rig", "rig.toml of the simulated rig (the default rig)")
+    file_option(emulate, "--write", "rig.toml to write, which connects to it", required=True)
     emulate.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
     for name in ("head", "fixed", "zoom", "board", "control"):
         emulate.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
     emulate.add_argument("--tcp", action="store_true", help="connect the head by TCP instead of a serial port")
     emulate.add_argument("--user", default="", metavar="NAME", help="user name that the fixed camera asks for (none)")
-    emulate.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="DEVICE.FAULT",
-        help="fault to be on from the start, one of those below; the control socket switches faults later",
-    )
-    emulate.more = operating.fault_names
+    about = "fault to be on from the start, one of those below; the control socket switches faults later"
+    emulate.add_argument("--fault", action="append", default=[], metavar="DEVICE.FAULT", help=about)
     emulate.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
+    emulate.more = operating.fault_names
 
-    view = command("view", running.view, "show the simulated scene, both cameras' frusta and their images")
-    view.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
+    about = "show the simulated scene, both cameras' frusta and their images"
+    view = command("view", running.view_command, about)
+    file_option(view, "--rig", "rig.toml of the simulated rig (the default rig)")
     view.add_argument("--target", metavar="NAME", help="follow this target of rig.toml")
-    view.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="calibration.json (the simulation's true calibration)"
-    )
+    file_option(view, "--calibration", "calibration.json (the simulation's true calibration)")
     view.add_argument("--browser", action="store_true", help="serve a page for a web browser on this machine")
     view.add_argument("--port", type=port, metavar="P", help=f"port of the page; 0: any free one ({running.PORT})")
     view.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")
 
-    detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any video")
-    detect.add_argument("film", type=Path, metavar="VIDEO", help="video to search")
-    detect.add_argument(
-        "--target", required=True, metavar="NAME", help="a target of rig.toml, or one of book, person, bird"
+    detect = command("detect", running.detect_command, "run the fixed camera's detector and tracker on any video")
+    file_option(detect, "film", "video to search", "VIDEO")
+    about = "a target of rig.toml, or one of book, person, bird"
+    detect.add_argument("--target", required=True, metavar="NAME", help=about)
+    about = (
+        "write one line per confirmed track and frame, to stdout with -: u_px and v_px are the box's centre, the score "
+        "is 0 where the box is only predicted"
     )
-    detect.add_argument(
-        "--csv",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="write one line per confirmed track and frame, to stdout with -: u_px and v_px are the box's centre, the "
-        "score is 0 where the box is only predicted",
+    file_option(detect, "--csv", about, required=True)
+    file_option(detect, "--video", "write the video with the tracks drawn (.mp4)", "OUT")
+    file_option(detect, "--rig", "rig.toml, for targets of your own")
+    about = (
+        "score the tracks by these boxes: a csv with frame,x_px,y_px,width_px,height_px, all from 0; x and y are of "
+        "the box's top-left pixel"
     )
-    detect.add_argument("--video", type=Path, metavar="OUT", help="write the video with the tracks drawn (.mp4)")
-    detect.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for targets of your own")
-    detect.add_argument(
-        "--labels",
-        type=Path,
-        metavar="FILE",
-        help="score the tracks by these boxes: a csv with frame,x_px,y_px,width_px,height_px, all from 0; x and y are "
-        "of the box's top-left pixel",
-    )
+    file_option(detect, "--labels", about)
 
-    board = command("board", calibrating.board, "write a calibration board to print, to scale")
-    board.add_argument("--out", type=Path, required=True, metavar="FILE", help="file to write: .pdf, .svg or .png")
-    board.add_argument(
-        "--kind", choices=KINDS, default=KINDS[0], help="kind of board; charuco has markers (chessboard)"
-    )
-    board.add_argument("--board", type=corners, default=(9, 6), metavar="CxR", help="inner corners (9x6)")
+    board = command("board", calibrating.board_command, "write a calibration board to print, to scale")
+    file_option(board, "--out", "file to write: .pdf, .svg or .png", required=True)
+    about = "kind of board; charuco has markers (chessboard)"
+    board.add_argument("--kind", choices=KINDS, default=KINDS[0], help=about)
+    board.add_argument("--board", type=board_corners, default=(9, 6), metavar="CxR", help="inner corners (9x6)")
     board.add_argument("--square", type=positive, default=0.025, metavar="M", help="side of a square [m] (0.025)")
 
-    doctor = command(
-        "doctor",
-        running.doctor,
-        "check versions, rendering and devices, and print the command that fixes what is missing",
-    )
-    doctor.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml: check its devices too, without moving them")
+    about = "check versions, rendering and devices, and print the command that fixes what is missing"
+    doctor = command("doctor", running.doctor_command, about)
+    file_option(doctor, "--rig", "rig.toml: check its devices too, without moving them")
     return parser

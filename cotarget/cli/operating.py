@@ -9,35 +9,34 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
-    check_board_is_told,
+    check_board_size,
     check_outputs,
     check_within,
     load_plausible,
+    naming,
     open_named,
     previous_kept,
     print_json,
     rig_files,
-    target_of,
 )
 from cotarget.errors import CalibrationError, ConfigError
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
-    from cotarget.config import TargetProfile
+    from cotarget.config import RigConfig, TargetProfile
 
 
 SMALL_PX = 10.0  # smaller sizes are printed with two digits, others as whole pixels
 
 
-def aim(options: argparse.Namespace) -> None:
+def aim_command(options: argparse.Namespace) -> None:
     """Run `cotarget aim`: print pan, tilt and focal length for one pixel of the fixed camera."""
     import numpy as np
 
     from cotarget.backends import describe, load_config
     from cotarget.calibration.joint import SAME_FOCAL
     from cotarget.config import RigConfig
-    from cotarget.targeting import Reach, WantedSize, depth_of, error_budget, point_at
-    from cotarget.targeting import aim as aim_at
+    from cotarget.targeting import Reach, WantedSize, aim, error_budget, point_at
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
     if config.backend == "replay":
@@ -46,83 +45,47 @@ def aim(options: argparse.Namespace) -> None:
     calibration = load_plausible(options.calibration, None if options.rig is None else spec, insist=options.insist)
     if options.rig is not None:
         calibration = calibration.for_streams(spec.fixed.size, spec.zoom.size)
-    target = None if options.target is None else target_of(config, options.target)
-    if options.size_px is not None and target is None:
-        raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
-    if options.wanted_px is not None and target is None:
-        raise ConfigError("--wanted-px needs --target NAME, whose true size gives the focal length")
-    if options.wanted_px is not None and target is not None:
-        side = calibration.zoom_head.lens.size[int(target.is_vertical())]
-        if options.wanted_px > side:
-            raise ConfigError(
-                f"--wanted-px: {options.wanted_px:g} px do not fit into the zoom camera's {{}}x{{}} image".format(
-                    *calibration.zoom_head.lens.size
-                )
-            )
-    depth = options.depth
-    if target is not None and options.size_px is not None:
-        depth = depth_of(calibration, target, options.size_px, np.array(options.pixel))
-        if not math.isfinite(depth):
-            raise ConfigError(
-                f"--size-px: {options.size_px:g} px is no size that a {options.target} of {target.size:g} m has in the "
-                "fixed camera's {}x{} image".format(*calibration.fixed.size)
-            )
+    target = _target(options, config, calibration)
+    pixel, size = np.array(options.pixel), calibration.fixed.size
+    if not (np.all(pixel >= -0.5) and np.all(pixel <= np.array(size) - 0.5)):
+        raise ConfigError(
+            f"--pixel: ({pixel[0]:g}, {pixel[1]:g}) is not in the fixed camera's {size[0]}x{size[1]} image"
+        )
+    depth = options.depth if target is None or options.size_px is None else _depth(options, target, calibration)
     pitch_mm = calibration.pitch_mm or spec.zoom.pitch_mm
     shortest, longest = spec.zoom.focal_range
     if options.rig is None:  # without a rig.toml, the calibration gives the shortest focal length
         shortest = calibration.zoom_head.lens.nominal_px[0]
     limits = spec.head.limits
     reach = Reach(limits.pan, limits.tilt, (shortest, max(shortest, longest)), step=limits.step)
-    wanted_size = (
-        WantedSize(target.size, options.wanted_px, target.is_vertical())
-        if target and options.wanted_px is not None
-        else None
-    )
-    nominal = None if options.focal_mm is None else options.focal_mm / pitch_mm
-    if nominal is not None:
-        shortest, longest = (f * pitch_mm for f in reach.focal_px)
-        check_within("--focal-mm", options.focal_mm, (shortest, longest), "the lens's {} mm")
-    pixel = np.array(options.pixel)
-    size = calibration.fixed.size
-    if not (np.all(pixel >= -0.5) and np.all(pixel <= np.array(size) - 0.5)):
-        raise ConfigError(
-            f"--pixel: ({pixel[0]:g}, {pixel[1]:g}) is not in the fixed camera's {size[0]}x{size[1]} image"
-        )
-    found = aim_at(
-        calibration,
-        point_at(calibration, pixel, depth),
-        reach,
-        wanted_size=wanted_size,
-        nominal_px=nominal,
-        method=options.ik,
-    )
+    wanted, nominal = None, None
+    if target is not None and options.wanted_px is not None:
+        wanted = WantedSize(target.size, options.wanted_px, target.is_vertical())
+    if options.focal_mm is not None:
+        bounds = reach.focal_px[0] * pitch_mm, reach.focal_px[1] * pitch_mm
+        check_within("--focal-mm", options.focal_mm, bounds, "the lens's {} mm")
+        nominal = options.focal_mm / pitch_mm
+    point = point_at(calibration, pixel, depth)
+    found = aim(calibration, point, reach, wanted_size=wanted, nominal_px=nominal, method=options.ik)
     # The error budget holds for the exact inverse; the shortcut's additional error is not modelled.
     budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
     calibrated = calibration.zoom_head.lens.nominal_px
     within = calibrated[0] * (1 - SAME_FOCAL) <= found.nominal_px <= calibrated[-1] * (1 + SAME_FOCAL)
     if not within:
-        print(
-            f"cotarget aim: {found.nominal_px * pitch_mm:.1f} mm is beyond the focal lengths calibrated, "
-            f"{calibrated[0] * pitch_mm:.1f} to {calibrated[-1] * pitch_mm:.1f} mm: the prediction only guesses there",
-            file=sys.stderr,
+        _warn(
+            f"{found.nominal_px * pitch_mm:.1f} mm is beyond the focal lengths calibrated, "
+            f"{calibrated[0] * pitch_mm:.1f} to {calibrated[-1] * pitch_mm:.1f} mm: the prediction only guesses there"
         )
     nearest, name = min(_fits_from(calibration, config.targets if target is None else {options.target: target}))
     plausible = found.depth >= nearest
     if not plausible:
         fits = f"no target, not even the {name}, fits" if target is None else f"the {name} does not fit"
-        print(
-            f"cotarget aim: {fits} into the fixed view nearer than {nearest:.2g} m: is a depth of {found.depth:g} m "
-            "meant?",
-            file=sys.stderr,
-        )
-    if wanted_size is not None and found.limited:
-        focal = calibration.zoom_head.lens.at(found.nominal_px).focal_px[int(wanted_size.vertical)]
-        shown, wanted = _pixels(focal * wanted_size.size / found.range), _pixels(wanted_size.wanted_px)
-        if shown != wanted:
-            print(
-                f"cotarget aim: the lens shows the {options.target} {shown} px large there, and not {wanted}",
-                file=sys.stderr,
-            )
+        _warn(f"{fits} into the fixed view nearer than {nearest:.2g} m: is a depth of {found.depth:g} m meant?")
+    if wanted is not None and found.limited:
+        focal = calibration.zoom_head.lens.at(found.nominal_px).focal_px[int(wanted.vertical)]
+        shown_px, wanted_px = _pixels(focal * wanted.size / found.range), _pixels(wanted.wanted_px)
+        if shown_px != wanted_px:
+            _warn(f"the lens shows the {options.target} {shown_px} px large there, and not {wanted_px}")
     print_json(
         {
             "pan_deg": math.degrees(found.pan),
@@ -140,11 +103,46 @@ def aim(options: argparse.Namespace) -> None:
     )
 
 
-def _fits_from(calibration: "Calibration", targets: Mapping[str, "TargetProfile"]) -> Iterator[tuple[float, str]]:
-    """Give each target's least depth [m] at which it fits into the fixed view, and its name.
+def _target(options: argparse.Namespace, config: "RigConfig", calibration: "Calibration") -> "TargetProfile | None":
+    """Look up the target of --target, and check the options that need it."""
+    if options.target is None:
+        if options.size_px is not None:
+            raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
+        if options.wanted_px is not None:
+            raise ConfigError("--wanted-px needs --target NAME, whose true size gives the focal length")
+        return None
+    with naming("--target"):
+        target = config.target(options.target)
+    size = calibration.zoom_head.lens.size
+    if options.wanted_px is not None and options.wanted_px > size[int(target.is_vertical())]:
+        raise ConfigError(
+            f"--wanted-px: {options.wanted_px:g} px do not fit into the zoom camera's {size[0]}x{size[1]} image"
+        )
+    return target
 
-    A depth below that is implausible.
-    """
+
+def _depth(options: argparse.Namespace, target: "TargetProfile", calibration: "Calibration") -> float:
+    """Compute the depth at which the target has the size of --size-px [m]."""
+    import numpy as np
+
+    from cotarget.targeting import depth_of
+
+    depth = depth_of(calibration, target, options.size_px, np.array(options.pixel))
+    if not math.isfinite(depth):
+        width, height = calibration.fixed.size
+        raise ConfigError(
+            f"--size-px: {options.size_px:g} px is no size that a {options.target} of {target.size:g} m has in the "
+            f"fixed camera's {width}x{height} image"
+        )
+    return depth
+
+
+def _warn(text: str) -> None:
+    print(f"cotarget aim: {text}", file=sys.stderr)
+
+
+def _fits_from(calibration: "Calibration", targets: Mapping[str, "TargetProfile"]) -> Iterator[tuple[float, str]]:
+    """Yield each target's least depth [m] at which it fits into the fixed view, and its name."""
     for name, target in targets.items():
         axis = int(target.is_vertical())
         yield calibration.fixed.lens.focal_px[axis] * target.size / calibration.fixed.size[axis], name
@@ -163,8 +161,8 @@ LOOK = 0.2  # polling interval [s]
 # Python's switch interval [s]. With the default of 5 ms, a line that is paced by its own thread loses half of its rate
 # beside the rendering.
 SWITCH_S = 5e-4
-WHO_IS_THERE = ("person",)  # targets of the scene without a rig.toml
-NOBODY = 'none; [sim] targets = ["person"] has one to follow'
+TARGETS = ("person",)  # targets of the scene without a rig.toml
+NO_TARGET = 'none; [sim] targets = ["person"] has one to follow'
 STOP_FILE = "stop"  # default stop file, beside the rig.toml that is written
 
 
@@ -175,7 +173,7 @@ def fault_names() -> str:
     return "faults: " + ", ".join(f"{device}.{name}" for device, names in FAULTS.items() for name in names)
 
 
-def emulate(options: argparse.Namespace) -> None:
+def emulate_command(options: argparse.Namespace) -> None:
     """Run `cotarget emulate`: serve a simulated rig by the devices' wire protocols, and write a rig.toml for it."""
     os.environ.setdefault(*RENDER_THREADS)
     sys.setswitchinterval(SWITCH_S)
@@ -185,7 +183,7 @@ def emulate(options: argparse.Namespace) -> None:
     from cotarget.emulators.world import paced
     from cotarget.files import write_atomically
 
-    config = RigConfig(sim=SimConfig(targets=WHO_IS_THERE)) if options.rig is None else load_config(options.rig)
+    config = RigConfig(sim=SimConfig(targets=TARGETS)) if options.rig is None else load_config(options.rig)
     if config.backend != "sim":
         raise ConfigError(f"{options.rig}: backend is '{config.backend}'; what is emulated is a simulated rig")
     beside: dict[str, Any] = {}
@@ -194,10 +192,8 @@ def emulate(options: argparse.Namespace) -> None:
     beside["safety"] = {"stop_file": STOP_FILE} | beside.get("safety", {})
     check_outputs([options.write], rig_files(options.rig, config))
     for fault in options.fault:
-        try:
+        with naming("--fault"):
             parse_fault(fault)
-        except ConfigError as error:
-            raise ConfigError(f"--fault: {error}") from None
     ports = Ports(options.host, options.head, options.fixed, options.zoom, options.board, options.control)
     password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
     if options.user and not password:
@@ -213,7 +209,7 @@ def emulate(options: argparse.Namespace) -> None:
             f"zoom     ptpip:{options.host}:{emulation.zoom.port}:{emulation.zoom.port}\n"
             f"board    socket://{options.host}:{emulation.board.port}\n"
             f"control  socket://{options.host}:{emulation.control.port}\n"
-            f"targets  {', '.join(config.sim.targets) or NOBODY}\n"
+            f"targets  {', '.join(config.sim.targets) or NO_TARGET}\n"
             f"{options.write} connects to them; Ctrl-C ends them",
             flush=True,
         )
@@ -232,7 +228,7 @@ ENOUGH_DIGITS = 4  # decimals of a latency [s]
 ACCURACY_S = 0.01
 
 
-def latency(options: argparse.Namespace) -> None:
+def latency_command(options: argparse.Namespace) -> None:
     """Run `cotarget latency`: measure the latencies of cameras, head and lens, and print them as keys of rig.toml."""
     from cotarget.backends import describe, load_config
     from cotarget.latency import measure_fixed, measure_head, measure_lens
@@ -246,7 +242,7 @@ def latency(options: argparse.Namespace) -> None:
     if options.calibration is not None:  # refused before the head moves
         calibration = load_plausible(options.calibration, describe(config), insist=options.insist)
         calibration.zoom_head.hand_eye()
-        check_board_is_told(options.rig, config)
+        check_board_size(options.rig, config)
     where = "sim" if config.backend == "sim" else "hardware"
     with open_named(options.rig, config) as rig:
         head = measure_head(rig)
@@ -282,7 +278,7 @@ def _plausible(name: str, seconds: float) -> float:
     return max(round(seconds, ENOUGH_DIGITS), 0.0)
 
 
-def point(options: argparse.Namespace) -> None:
+def point_command(options: argparse.Namespace) -> None:
     """Run `cotarget point`: move head and lens, and write a picture of each camera on request."""
     from cotarget.backends import load_config
     from cotarget.calibration.captures import write_image
@@ -330,7 +326,7 @@ def point(options: argparse.Namespace) -> None:
     )
 
 
-def stop(options: argparse.Namespace) -> None:
+def stop_command(options: argparse.Namespace) -> None:
     """Run `cotarget stop`: write the stop file."""
     from cotarget.safety.stop_file import find_stop_file, write_stop_file
 
@@ -339,7 +335,7 @@ def stop(options: argparse.Namespace) -> None:
     print(f"stopped: no head that watches {path} moves until cotarget clear")
 
 
-def clear(options: argparse.Namespace) -> None:
+def clear_command(options: argparse.Namespace) -> None:
     """Run `cotarget clear`: remove the stop file."""
     from cotarget.safety.stop_file import clear_stop_file, find_stop_file
 
@@ -348,7 +344,7 @@ def clear(options: argparse.Namespace) -> None:
     print(f"{path}: there was no stop" if reason is None else f"cleared: {reason}")
 
 
-def reset_head(options: argparse.Namespace) -> None:
+def reset_head_command(options: argparse.Namespace) -> None:
     """Run `cotarget reset-head`: reset the pan-tilt unit after consent."""
     from cotarget.backends import load_config
     from cotarget.drivers.clock import MonotonicClock

@@ -217,7 +217,7 @@ def parse_spec(table: Mapping[str, Any], described: Callable[[], RigSpec]) -> Ri
     return RigSpec(fixed, zoom, head, bool(table["real_time"]))
 
 
-def read_json(path: Path) -> Mapping[str, Any]:
+def _read_meta(path: Path) -> Mapping[str, Any]:
     """Read recording.json and check its schema.
 
     Raises:
@@ -326,7 +326,7 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
     """
     if not directory.exists():
         raise ConfigError(f"{directory}: no such folder; give the folder of a recording")
-    meta = read_json(directory / META)
+    meta = _read_meta(directory / META)
     target, selector_table, config = _parse_meta(directory, meta)
     if not (directory / CALIBRATION).is_file():
         raise ConfigError(f"{directory / CALIBRATION}: no such file; the recording is not whole")
@@ -376,7 +376,7 @@ def read_spec(directory: Path, describe: Callable[[RigConfig], RigSpec]) -> RigS
     Raises:
         ConfigError: the folder is no recording, has another schema, or does not say it.
     """
-    _, _, config = _parse_meta(directory, read_json(directory / META))
+    _, _, config = _parse_meta(directory, _read_meta(directory / META))
     with suppress(_DamageError):
         for number, row in _rows(directory / LOG):
             if "rig" in row:

@@ -178,7 +178,7 @@ class RecordWriter:
     def _write(self, event: Event | dict[str, Any], picture: _Picture | None) -> None:
         if picture is not None:
             if picture.image is not None:
-                picture.size_bytes = self._write_image(picture.name, picture.image)
+                picture.size_bytes = write_png(self._directory / picture.name, picture.image)
                 with self._changed:
                     self._waiting -= picture.image.nbytes
                     picture.image = None
@@ -189,14 +189,14 @@ class RecordWriter:
         text = event_line(event) if isinstance(event, Event) else json.dumps(event, allow_nan=False)
         self._log.write(text.encode() + b"\n")
 
-    def _write_image(self, name: str, image: Image) -> int:
-        """Write an image, which appears under its name when complete; return its size on disk [bytes]."""
-        data = cv2.imencode(".png", image, PNG_OPTIONS)[1].tobytes()
-        path = self._directory / name
-        part = path.with_suffix(".part")
-        part.write_bytes(data)
-        part.replace(path)
-        return len(data)
+
+def write_png(path: Path, image: Image) -> int:
+    """Write an image, which appears under its name when complete; return its size on disk [bytes]."""
+    data = cv2.imencode(".png", image, PNG_OPTIONS)[1].tobytes()
+    part = path.with_suffix(".part")
+    part.write_bytes(data)
+    part.replace(path)
+    return len(data)
 
 
 # The recorded rig

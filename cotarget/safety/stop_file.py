@@ -60,6 +60,8 @@ def find_stop_file(rig: Path) -> Path:
         said = (lines[0][1] or (False if lines[0][2] else "")) if len(lines) == 1 else None
         if said == "" or len(lines) > 1 or not (lines or backend):
             raise ConfigError(f"{rig}: is not TOML: {error}; {by_hand}") from None
+    if not isinstance(said, str | None) and said is not False:
+        raise ConfigError(f'{rig}: safety.stop_file: {said!r} is not a text; name a file, as "stop"')
     path = locate_stop_file(rig, backend, said)
     if path is None or path.name in ("", "..") or path == rig.parent:
         raise ConfigError(f'{rig}: has no stop file; give one: [safety] stop_file = "stop"')
@@ -98,10 +100,10 @@ def refuse_if_stopped(path: Path | None) -> None:
         ConfigError: its folder does not exist, or cannot be written.
     """
     if path is not None and not path.parent.is_dir():
-        raise ConfigError(f"{path}: nobody could stop the head by this file: {_no_folder(path)}")
+        raise ConfigError(f"{path}: the head could not be stopped by this file: {_no_folder(path)}")
     if path is not None and not os.access(path.parent, os.W_OK):
         raise ConfigError(
-            f"{path}: nobody could stop the head by this file: {path.parent} cannot be written; allow it, or name a "
+            f"{path}: the head could not be stopped by this file: {path.parent} cannot be written; allow it, or name a "
             "file elsewhere: stop_file in [safety] of rig.toml"
         )
     if (reason := stop_reason(path)) is not None:

@@ -24,7 +24,7 @@ from cotarget.calibration import Calibration, Options, calibrate_photos, calibra
 from cotarget.calibration.bundle import fit
 from cotarget.calibration.initialization import place_boards
 from cotarget.calibration.uncertainty import model_of
-from cotarget.cli.common import corners, count, positive
+from cotarget.cli.common import board_corners, positive, positive_int
 from cotarget.cli.main import Parser
 from cotarget.config import FEWEST_CORNERS, BoardConfig
 from experiments.engine.checks import check_above, check_least
@@ -173,10 +173,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--right", default=SETTINGS.right, metavar="GLOB")
     board = (SETTINGS.columns, SETTINGS.rows)
     parser.add_argument(
-        "--board", type=corners, default=board, metavar="CxR", help="inner corners ({}x{})".format(*board)
+        "--board", type=board_corners, default=board, metavar="CxR", help="inner corners ({}x{})".format(*board)
     )
     parser.add_argument("--square", type=positive, default=SETTINGS.square, metavar="M", help="side of a square [m]")
-    parser.add_argument("--processes", type=count, default=os.cpu_count() or 1, metavar="P")
+    parser.add_argument("--processes", type=positive_int, default=os.cpu_count() or 1, metavar="P")
     parser.add_argument("--quick", action="store_true", help="leave out two pairs only")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write result.json, rows.csv and figure.png there")
     given = parser.parse_args(arguments)

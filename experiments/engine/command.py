@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from cotarget.cli.common import count, not_negative, progress_bar
+from cotarget.cli.common import not_negative, positive_int, progress_bar
 from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.report.text import count as number_of
@@ -85,7 +85,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--list", action="store_true", help="tell which there are")
     parser.add_argument("--quick", action="store_true", help="less of each, as its own --help says")
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"results and report ({OUT}, or {OUT_QUICK} if quick)")
-    parser.add_argument("--seeds", type=count, metavar="N", help="of each; its own number by default")
+    parser.add_argument("--seeds", type=positive_int, metavar="N", help="of each; its own number by default")
     parser.add_argument("--seed-base", type=not_negative, metavar="B", help="the first seed (0)")
     parser.add_argument(
         "--set",
@@ -96,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--processes",
-        type=count,
+        type=positive_int,
         default=processes,
         metavar="P",
         help=f"jobs at a time, but one where time is measured ({processes})",

@@ -24,7 +24,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from cotarget.cli.common import count, not_negative, progress_bar
+from cotarget.cli.common import not_negative, positive_int, progress_bar
 from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.files import write_atomically
@@ -134,11 +134,13 @@ class Experiment(Generic[S]):
         """Run the experiment's command: run the seeds, print the figures, and write files on request."""
         parser = Parser(prog=f"python -m {self._module()}", description=self.purpose)
         seeds, processes = self.settings.seeds, os.cpu_count() or 1
-        parser.add_argument("--seeds", type=count, metavar="N", help=f"how many ({seeds}; {self.quick.seeds} if quick)")
+        parser.add_argument(
+            "--seeds", type=positive_int, metavar="N", help=f"how many ({seeds}; {self.quick.seeds} if quick)"
+        )
         parser.add_argument("--seed-base", type=not_negative, default=0, metavar="B", help="the first seed (0)")
         parser.add_argument(
             "--processes",
-            type=count,
+            type=positive_int,
             default=processes,
             metavar="P",
             help=f"jobs at a time, but one where time is measured ({processes})",
@@ -297,7 +299,7 @@ def _all(engine: Engine, work: Callable[[Any], Any], jobs: Sequence[Any], proces
             if result is Died:
                 raise DeviceError(f"the process of job {number + 1} of {len(jobs)} died; is there memory enough?")
             found[number] = result
-            show(f"{len(found)} of {len(jobs)} jobs", len(found), len(jobs))
+            show(len(found), len(jobs), f"{len(found)} of {len(jobs)} jobs")
     return [found[number] for number in sorted(found)]
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cotarget.errors import ConfigError
+from cotarget.parallel import Progress
 from experiments.engine import sessions
 from experiments.engine.cases import Case
 from experiments.engine.results import Jobs, Record, Spent, code_version, differing
@@ -20,7 +21,6 @@ from experiments.engine.tasks import Done, Task, perform
 from experiments.engine.workers import Engine, in_turn
 
 DIED = "its process died; is there memory enough?"
-Show = Callable[[str, float, float], None]  # called with (text, amount done, total)
 
 
 @dataclass
@@ -79,7 +79,7 @@ class Sweep:
         """Cost of preparing what each case's jobs share; zero where it is counted with another case."""
         return [files.read_shared() for files in self._files]
 
-    def run(self, engine: Engine, show: Show, what: str) -> None:
+    def run(self, engine: Engine, show: Progress, what: str) -> None:
         """Run the missing jobs, and the failed ones again.
 
         Args:
@@ -101,7 +101,7 @@ class Sweep:
         finally:
             self._log.write()
 
-    def _prepare(self, engine: Engine, show: Show) -> dict[int, Any]:
+    def _prepare(self, engine: Engine, show: Progress) -> dict[int, Any]:
         """Prepare what the jobs of each case share, by case number; where that fails, the jobs count as failed."""
         wanted: dict[Any, list[int]] = {}
         for i, case in enumerate(self.cases):
@@ -127,7 +127,7 @@ class Sweep:
         one = functools.partial(case.experiment.one, shared, case.settings)
         return [Task(i, number, functools.partial(one, number)) for number in sorted(self._missing[i])]
 
-    def _do(self, tasks: Sequence[Task], using: Engine, show: Show, keep: Callable[[Task, Done], None]) -> None:
+    def _do(self, tasks: Sequence[Task], using: Engine, show: Progress, keep: Callable[[Task, Done], None]) -> None:
         """Run tasks, the longest first, and keep each result at once."""
         if not tasks:
             return
@@ -165,14 +165,14 @@ class Sweep:
         self.records[i][number] = record
         self._missing[i].discard(number)
 
-    def _tell(self, show: Show, last: str = "") -> None:
-        """Show the progress, in which jobs count by their expected time."""
+    def _tell(self, show: Progress, last: str = "") -> None:
+        """Progress the progress, in which jobs count by their expected time."""
         costs = [case.experiment.cost_s for case in self.cases]
         total = sum(cost * len(case.numbers) for cost, case in zip(costs, self.cases, strict=True))
         left = sum(cost * len(missing) for cost, missing in zip(costs, self._missing, strict=True))
         failed = f", {self.failed} failed" if self.failed else ""
         text = f"{self.done} of {self.total} jobs{failed}"
-        show(f"{text}; last {last}" if last else text, total - left, total)
+        show(total - left, total, f"{text}; last {last}" if last else text)
 
 
 def forget(cases: Sequence[Case], folder: Path) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cotarget.cli.common import count, not_negative
+from cotarget.cli.common import not_negative, positive_int
 from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, choices
 from experiments.engine.bounds import compare
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = Parser(prog="python -m experiments.wire.wire", description=EXPERIMENT.purpose)
     parser.add_argument("--only", nargs="+", choices=tuple(RUNS), default=SETTINGS.only, metavar="NAME", help="figures")
     parser.add_argument("--fault", nargs="+", choices=faults_module.all_faults(), metavar="DEVICE.FAULT", help="these")
-    parser.add_argument("--repetitions", type=count, metavar="N", help=f"of each fault ({SETTINGS.repetitions})")
+    parser.add_argument("--repetitions", type=positive_int, metavar="N", help=f"of each fault ({SETTINGS.repetitions})")
     parser.add_argument("--seed-base", type=not_negative, default=0, metavar="B", help="the seed (0)")
     parser.add_argument("--quick", action="store_true", help="each for some seconds only")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write result.json and rows.csv there")

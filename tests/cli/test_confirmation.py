@@ -10,7 +10,7 @@ from cotarget.config import RigConfig
 from cotarget.evaluation import true_calibration
 from cotarget.geometry import pose
 from cotarget.sim.world import SimWorld
-from tests.cli.test_commands import call
+from tests.support.commands import call
 from tests.support.rigs import with_zoom_head
 
 SECONDS = 5.0  # the book is found at once, the lens needs a second, and 3 s without a sight are unconfirmed

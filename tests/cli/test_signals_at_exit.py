@@ -14,7 +14,7 @@ import pytest
 
 from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
-from tests.cli.test_commands import true_calibration
+from tests.support.commands import true_calibration
 from tests.support.safety_rigs import DEADLINE_S
 
 # A program with a rig in real time that says what its devices are told; a halt waits for a line on stdin.

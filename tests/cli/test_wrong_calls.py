@@ -1,22 +1,25 @@
-"""Wrong calls of all commands: the exit status, one line that names the command and the option, key or file, no file.
-
-`test_commands` and `test_operating` have more mistakes of single commands.
-"""
+"""Wrong calls of all commands: exit status, one line that names command and option, key or file, and no file made."""
 
 import shlex
+import socket
+import sys
 
+import cv2
+import numpy as np
 import pytest
 
 from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
-from tests.cli.test_commands import call, true_calibration
-from tests.test_video import bird_film
+from cotarget.geometry import RigidTransform
+from tests.support.commands import OLD, bird_film, board_photo, call, capture, refused, true_calibration, write_index
+from tests.support.rigs import with_zoom_head
 
 FAILED, USAGE = 1, 2
-HARDWARE = """
+NO_PORT = "/dev/nobody-is-here"
+HARDWARE = f"""
 backend = "hardware"
 [hardware.head]
-port = "/dev/nobody"
+port = "{NO_PORT}"
 [hardware.fixed]
 url = "http://127.0.0.1:9"
 [hardware.zoom]
@@ -24,130 +27,320 @@ port = "usb:"
 """
 FILES = {
     "rig.toml": '[sim]\nscene = "indoor"\ntargets = ["book"]\n[safety]\nstop_file = "stop"\n',
+    "sim.toml": "[sim]\n",
+    "dog.toml": "[targets.dog]\nsize = 0.6\ndimension = 'height'\nwanted_px = 200\ndetector = 'motion'\n",
+    "narrow.toml": "[safety]\npan_deg = [-5, 5]\n",
+    "other_shape.toml": "[sim.fixed]\nsize = [640, 360]\n",
+    "typo.toml": "[sim]\nscenery = 1\n",
+    "moon.toml": '[sim]\nscene = "moon"\n',
+    "whale.toml": '[sim]\ntargets = ["whale"]\n',
+    "broken.toml": "[sim\n",
+    "unstoppable.toml": "[safety]\nstop_file = 5\n",
     "nameless.toml": 'backend = "hardware"\n[board]\nsquare = 0.1\n',
     "number.toml": 'backend = "hardware"\n[hardware.head]\nport = 5\n',
     "hw.toml": HARDWARE,
     "replay.toml": 'backend = "replay"\nrecording = "none"\n',
     "of_nothing.toml": 'backend = "replay"\n',
-    "typo.toml": "[sim]\nscenery = 1\n",
+    "broken.json": '{"schema": 2, "fixed": {',
+    "empty.json": '{"schema": 2}',
     "list.json": "[1, 2]",
+    "text.mp4": "no film",
     "other.csv": "a,b\n1,2\n",
     "late.csv": "frame,x_px,y_px,width_px,height_px\n900,1,2,3,4\n",
+    **dict.fromkeys(("out.json", "out.csv", "out.mp4"), OLD),
+    "index/index.json": '{"schema": 1, "board": 5, "pitch_mm": null, "captures": [1]}',
+    "cut/index.json": '{"schema": 1, "boa',
 }
-FOLLOW = "follow --calibration good.json --seconds 1 --target"
 AIM = "aim --calibration good.json --pixel 320 240"
+FOLLOW = "follow --calibration good.json --rig rig.toml --target book"
+TARGET = "follow --calibration good.json --rig rig.toml --target"
 DETECT = "detect film.mp4 --target bird --csv"
+OUT = "calibrate --out out.json"
+PHOTOS = "--fixed 'left*.png' --zoom 'right*.png' --board 9x6 --square 0.1"
+SINGLE = f"{OUT} --from single --fixed 'left*.png' --zoom 'right*.png'"
+POSE = "millimetres.json: T_zoom0_fixed"
+# The command line, the exit status, and what the line names.
 CALLS = [
-    ("demo --seed 1.5", USAGE, "--seed", "'1.5' is not a whole number"),
-    ("demo --out film.mp4", FAILED, "film.mp4", "name a folder"),
+    ("", USAGE, "COMMAND"),
+    ("dance", USAGE, "'dance'", "calibrate"),
+    ("demo --seed 1.5", USAGE, "--seed", "'1.5'"),
+    ("demo --seed -1", USAGE, "--seed", "'-1'"),
+    ("demo --seed ²", USAGE, "--seed"),
+    ("demo --out film.mp4", FAILED, "film.mp4"),
+    ("demo --out out.json/x", FAILED, "out.json/x"),
+    # calibrate
     ("calibrate", USAGE, "--rig", "--from"),
-    ("calibrate --rig none.toml", FAILED, "none.toml: no such file"),
-    ("calibrate --rig number.toml", FAILED, "number.toml: hardware.head.port: 5 is not a text"),
-    ("calibrate --rig hw.toml", FAILED, "hw.toml", "[board] square = 0.025"),
+    ("calibrate --rig folder", FAILED, "folder"),
+    ("calibrate --rig moon.toml", FAILED, "moon.toml: ", "'moon'", "indoor, outdoor"),
+    ("calibrate --rig whale.toml", FAILED, "whale.toml: sim.targets", "'whale'", "bird, book, person"),
+    ("calibrate --rig number.toml", FAILED, "number.toml: hardware.head.port"),
     ("calibrate --rig nameless.toml", FAILED, "nameless.toml: hardware.head.port"),
-    ("calibrate --rig rig.toml --placements 0", USAGE, "--placements", "'0' is not a whole number from 1"),
+    ("calibrate --rig rig.toml --placements 0", USAGE, "--placements", "'0'"),
     ("calibrate --rig rig.toml --stops x", USAGE, "--stops", "'x'"),
-    ("calibrate --rig rig.toml --out -", FAILED, "-: stdout takes the table of --csv alone"),
-    ("calibrate --from film.mp4", FAILED, "film.mp4: no such folder"),
+    ("calibrate --rig rig.toml --out -", FAILED, "-: "),
+    ("calibrate --rig rig.toml --out rig.toml", FAILED, "rig.toml: "),
+    ("calibrate --rig rig.toml --out none/c.json", FAILED, "none/c.json"),
+    ("calibrate --rig rig.toml --out folder", FAILED, "folder: "),
+    ("calibrate --rig rig.toml --board 9x6", FAILED, "--board", "--from"),
+    ("calibrate --rig rig.toml --kind charuco", FAILED, "--kind", "--from"),
+    ("calibrate --rig rig.toml --insist --method sequential", FAILED, "--insist", "--method joint"),
+    (f"{OUT} --from grey {PHOTOS}", FAILED, "grey: ", "9x6"),
+    (f"{OUT} --from single {PHOTOS}", FAILED, "3"),
+    (f"{OUT} --from folder {PHOTOS}", FAILED, "folder: ", "'left*.png'"),
+    (f"{OUT} --from none {PHOTOS}", FAILED, "none: "),
+    (f"{OUT} --from folder", FAILED, "folder: ", "index.json"),
+    (f"{OUT} --from none", FAILED, "none: ", "--from"),
+    (f"{OUT} --from film.mp4", FAILED, "film.mp4: "),
+    (f"{OUT} --from index", FAILED, "index/index.json: ", "board"),
+    (f"{OUT} --from cut", FAILED, "cut/index.json: "),
+    (f"{OUT} --from no_fixed", FAILED, "no_fixed: ", "fixed camera"),
+    (f"{OUT} --from no_zoom", FAILED, "no_zoom: ", "zoom camera"),
+    (f"{OUT} --from index --kind charuco", FAILED, "--fixed, --zoom, --board and --square"),
+    (f"{OUT} --from index --encoders --method sequential", FAILED, "--encoders", "--method joint"),
+    (f"{OUT} --from index --captures x", FAILED, "--captures", "--rig"),
+    (f"{OUT} --from index --stops 3", FAILED, "--stops", "--rig"),
+    (f"{SINGLE} --square 0.1 --board 9by6", USAGE, "--board", "9by6", "9x6"),
+    (f"{SINGLE} --square 0.1 --board 2x6", USAGE, "--board", "2x6"),
+    (f"{SINGLE} --square 0.1 --board 7x6", FAILED, "single: ", "7x6"),
+    (f"{SINGLE} --square 0.1 --board 7x7", FAILED, "7x7"),
+    (f"{SINGLE} --square 25 --board 9x6", FAILED, "--square", "0.025"),
+    (f"{SINGLE} --square 0 --board 9x6", USAGE, "--square"),
+    (f"{OUT} --from single {PHOTOS} --kind circles", USAGE, "--kind", "circles", "charuco"),
+    (f"{OUT} --from single {PHOTOS} --kind charuco", FAILED, "single: ", "charuco of 9x6"),
+    (f"{OUT} --from single {PHOTOS} --encoders", FAILED, "--encoders", "--rig"),
+    # report and board
     ("report", USAGE, "FILE"),
-    ("report none.json", FAILED, "none.json: no such file"),
-    ("report list.json", FAILED, "list.json", "calibration.json"),
+    ("report none.json", FAILED, "none.json"),
+    ("report list.json", FAILED, "list.json"),
     ("report film.mp4", FAILED, "film.mp4", "UTF-8"),
-    ("report good.json --out folder", FAILED, "folder: is a folder"),
-    ("report good.json --out film.mp4/page.html", FAILED, "film.mp4/page.html: film.mp4 is a file, not a folder"),
-    (f"{AIM}", USAGE, "--depth", "--size-px"),
-    (f"{AIM} --depth 5 --rig typo.toml", FAILED, "typo.toml", "sim.scenery"),
-    (f"{AIM} --depth 5 --target dog", FAILED, "--target: unknown target 'dog'", "bird, book, person"),
-    (f"{AIM} --depth 5 --target book --wanted-px 5000", FAILED, "--wanted-px: 5000 px", "640x480"),
-    ("aim --calibration wide.json --pixel 3 4 --depth 5 --rig rig.toml", FAILED, "wide.json: ", "aspect ratio"),
-    ("aim --calibration good.json --pixel a b --depth 5", USAGE, "--pixel", "'a'"),
-    (f"{FOLLOW} cat --rig rig.toml", FAILED, "--target: unknown target 'cat'"),
-    (f"{FOLLOW} bird --rig rig.toml", FAILED, "rig.toml", '[sim] targets = ["book", "bird"]'),
-    (f"{FOLLOW} book --rig hw.toml", FAILED, "good.json: ", "704x576", "aspect ratio"),
-    (f"{FOLLOW} book --rig replay.toml", FAILED, "none: is no recording"),
-    (f"{FOLLOW} book --rig of_nothing.toml", FAILED, "of_nothing.toml: recording: is missing"),
-    (f"{FOLLOW} book --rig rig.toml --click 900 2", FAILED, "--click: (900, 2)", "640x480"),
-    (f"{FOLLOW} book --rig rig.toml --policy best", USAGE, "--policy", "first-come"),
-    (f"{FOLLOW} book --rig rig.toml --record film.mp4", FAILED, "film.mp4: is a file; give a new folder"),
-    (f"{FOLLOW} book --rig rig.toml --video -", FAILED, "-: stdout takes the table of --csv alone"),
-    ("replay none", FAILED, "none: no such folder"),
-    ("replay folder", FAILED, "folder: is no recording"),
-    ("replay film.mp4 --check x", USAGE, "unrecognized arguments: x"),
-    ("point --rig rig.toml --pan-deg x", USAGE, "--pan-deg", "'x' is not a number"),
-    ("point --rig nameless.toml", FAILED, "nameless.toml: hardware.head.port"),
-    ("point --rig replay.toml", FAILED, "replay.toml: backend is 'replay'"),
-    ("point --rig rig.toml --pictures film.mp4", FAILED, "film.mp4 is a file, not a folder"),
-    ("latency --rig rig.toml --calibration list.json", FAILED, "list.json"),
-    ("latency --rig nameless.toml", FAILED, "nameless.toml: hardware.head.port"),
-    ("stop --rig none.toml", FAILED, "none.toml: "),
-    ("clear", USAGE, "--rig"),
-    ("reset-head --rig rig.toml", FAILED, "rig.toml: names no pan-tilt unit"),
-    ("emulate --rig rig.toml", USAGE, "--write"),
-    ("emulate --write new.toml --fault a.b", FAILED, "--fault: unknown fault 'a.b'", "fixed., head., zoom."),
-    ("emulate --write -", FAILED, "-: stdout takes the table of --csv alone"),
-    ("view --port 5", FAILED, "--port", "--browser"),
-    ("view --target dog", FAILED, "--target: unknown target 'dog'"),
-    ("view --rig hw.toml", FAILED, "hw.toml: backend is 'hardware'"),
-    ("detect film.mp4", USAGE, "--target", "--csv"),
-    ("detect none.mp4 --target bird --csv new.csv", FAILED, "none.mp4: no such file"),
-    (f"{DETECT} new.csv --rig none.toml", FAILED, "none.toml: no such file"),
-    (f"{DETECT} new.csv --labels other.csv", FAILED, "other.csv", "frame, x_px"),
-    (f"{DETECT} new.csv --video new.txt", FAILED, "new.txt: cannot be written", ".mp4"),
-    (f"{DETECT} - --labels late.csv", FAILED, "--labels", "--csv"),
+    ("report millimetres.json --out page.html", FAILED, POSE, "metres", "--insist"),
+    ("report good.json --out folder", FAILED, "folder: "),
+    ("report good.json --out film.mp4/page.html", FAILED, "film.mp4/page.html: film.mp4"),
     ("board", USAGE, "--out"),
     ("board --out new.txt", FAILED, "new.txt", ".pdf, .png, .svg"),
-    ("board --out new.pdf --board 7x7", FAILED, "--board: 7x7 looks the same upside down"),
-    ("board --out new.pdf --square 25", FAILED, "--square: 25 m", "25 mm are 0.025"),
+    ("board --out /dev/null", FAILED, "/dev/null"),
+    ("board --out new.pdf --square 25", FAILED, "--square", "0.025"),
     ("board --out new.pdf --kind ring", USAGE, "--kind", "charuco"),
-    ("doctor --rig none.toml", FAILED, "none.toml: no such file"),
+    # aim
+    (AIM, USAGE, "--depth", "--size-px"),
+    (f"{AIM} --depth 5 --size-px 16", USAGE, "--size-px", "--depth"),
+    (f"{AIM} --depth -3", USAGE, "--depth", "-3"),
+    (f"{AIM} --depth nan", USAGE, "--depth", "nan"),
+    (f"{AIM} --depth far", USAGE, "--depth", "'far'"),
+    (f"{AIM} --depth 1e300", FAILED, "1e+300"),
+    (f"{AIM} --depth 5 --fast", USAGE, "--fast"),
+    (f"{AIM} --depth 5 --ik magic", USAGE, "--ik", "magic", "exact", "paper-table"),
+    (f"{AIM} --depth 5 --rig typo.toml", FAILED, "typo.toml", "sim.scenery", "scene"),
+    (f"{AIM} --depth 5 --rig other_shape.toml", FAILED, "good.json: ", "640x360", "640x480"),
+    (f"{AIM} --depth 0.5 --rig narrow.toml", FAILED, "pan -5 to 5"),
+    (f"{AIM} --depth 5 --target dog", FAILED, "--target", "'dog'", "bird, book, person"),
+    (f"{AIM} --depth 5 --wanted-px 16", FAILED, "--wanted-px", "--target"),
+    (f"{AIM} --depth 5 --target book --wanted-px 5000", FAILED, "--wanted-px", "5000", "640x480"),
+    (f"{AIM} --depth 5 --focal-mm 100", FAILED, "--focal-mm", "100", "6 to 72 mm"),
+    (f"{AIM} --depth 5 --focal-mm 5.9", FAILED, "--focal-mm", "6 to 72 mm"),
+    (f"{AIM} --size-px 16", FAILED, "--size-px", "--target"),
+    (f"{AIM} --size-px 0 --target book", USAGE, "--size-px"),
+    (f"{AIM} --size-px 5000 --target book", FAILED, "--size-px", "book of 0.234 m", "640x480"),
+    (f"{AIM} --size-px 1e-320 --target book", FAILED, "--size-px"),
+    ("aim --calibration good.json --pixel 640 240 --depth 5", FAILED, "--pixel", "(640, 240)", "640x480"),
+    ("aim --calibration good.json --pixel nan 240 --depth 5", FAILED, "--pixel", "(nan, 240)"),
+    ("aim --calibration good.json --pixel a b --depth 5", USAGE, "--pixel", "'a'"),
+    ("aim --calibration good.json --pixel 5 --depth 5", USAGE, "--pixel"),
+    ("aim --calibration none.json --pixel 3 4 --depth 5", FAILED, "none.json"),
+    ("aim --calibration broken.json --pixel 3 4 --depth 5", FAILED, "broken.json"),
+    ("aim --calibration headless.json --pixel 3 4 --depth 5", FAILED, "T_head_zoom"),
+    ("aim --calibration millimetres.json --pixel 3 4 --depth 5", FAILED, POSE, "metres", "--insist"),
+    ("aim --calibration wide.json --pixel 3 4 --depth 5 --rig rig.toml", FAILED, "wide.json: ", "640x360"),
+    # follow and replay
+    (f"{TARGET} cat", FAILED, "--target", "'cat'"),
+    ("follow --calibration good.json --rig dog.toml --target dog", FAILED, "dog.toml", "bird, book, person"),
+    ("follow --calibration good.json --rig hw.toml --target book", FAILED, "good.json: ", "704x576"),
+    ("follow --calibration good.json --rig replay.toml --target book", FAILED, "none: "),
+    ("follow --calibration good.json --rig of_nothing.toml --target book", FAILED, "of_nothing.toml: recording"),
+    ("follow --calibration empty.json --rig rig.toml --target book", FAILED, "empty.json"),
+    ("follow --calibration wide.json --rig rig.toml --target book", FAILED, "wide.json: ", "640x480", "640x360"),
+    ("follow --calibration millimetres.json --rig rig.toml --target book", FAILED, POSE, "metres", "--insist"),
+    (f"{FOLLOW} --seconds 0", USAGE, "--seconds"),
+    (f"{FOLLOW} --policy best", USAGE, "--policy", "'best'", "first-come"),
+    (f"{FOLLOW} --click 640 3", FAILED, "--click", "(640, 3)", "640x480"),
+    (f"{FOLLOW} --click -1 3", FAILED, "--click", "(-1, 3)"),
+    (f"{FOLLOW} --click 3 nan", USAGE, "--click", "nan"),
+    (f"{FOLLOW} --click 3", USAGE, "--click"),
+    (f"{FOLLOW} --track 0", USAGE, "--track", "'0'"),
+    (f"{FOLLOW} --track 1 --policy first-come", USAGE, "--track", "--policy"),
+    (f"{FOLLOW} --csv good.json", FAILED, "good.json: "),
+    (f"{FOLLOW} --csv out.csv --video out.csv", FAILED, "out.csv: "),
+    (f"{FOLLOW} --csv none/out.csv", FAILED, "none/out.csv"),
+    (f"{FOLLOW} --video none/out.mp4", FAILED, "none/out.mp4"),
+    (f"{FOLLOW} --video -", FAILED, "-: "),
+    (f"{FOLLOW} --record film.mp4", FAILED, "film.mp4: "),
+    ("replay none", FAILED, "none: "),
+    ("replay folder", FAILED, "folder: "),
+    ("replay film.mp4", FAILED, "film.mp4: "),
+    ("replay film.mp4 --check x", USAGE, "x"),
+    # what operates a rig; refused before any device is opened
+    ("point --rig rig.toml --pan-deg x", USAGE, "--pan-deg", "'x'"),
+    ("point --rig nameless.toml", FAILED, "nameless.toml: hardware.head.port"),
+    ("point --rig replay.toml", FAILED, "replay.toml: backend"),
+    ("point --rig rig.toml --pictures film.mp4", FAILED, "film.mp4"),
+    ("latency --rig replay.toml", FAILED, "replay.toml: backend"),
+    ("latency --rig nameless.toml", FAILED, "hardware.head.port", "/dev/tty"),
+    ("latency --rig hw.toml", FAILED, "http://127.0.0.1:9"),
+    ("latency --rig hw.toml --calibration none.json", FAILED, "none.json"),
+    ("latency --rig hw.toml --calibration wide.json", FAILED, "wide.json"),
+    ("latency --rig rig.toml --calibration list.json", FAILED, "list.json"),
+    ("latency --rig rig.toml --calibration headless.json", FAILED, "T_head_zoom"),
+    ("latency --rig rig.toml --calibration millimetres.json", FAILED, POSE, "metres", "--insist"),
+    ("stop", USAGE, "--rig"),
+    ("stop --rig none.toml", FAILED, "none.toml: "),
+    ("stop --rig unstoppable.toml", FAILED, "unstoppable.toml: safety.stop_file: 5"),
+    ("clear", USAGE, "--rig"),
+    ("clear --rig sim.toml", FAILED, "sim.toml: ", "[safety] stop_file"),
+    ("reset-head --rig sim.toml --yes", FAILED, "sim.toml: "),
+    ("reset-head --rig nameless.toml --yes", FAILED, "nameless.toml: "),
+    ("reset-head --rig hw.toml --yes", FAILED, NO_PORT),
+    ("emulate", USAGE, "--write"),
+    ("emulate --rig hw.toml --write new.toml", FAILED, "hw.toml: backend"),
+    ("emulate --write new.toml --user root", FAILED, "--user", "COTARGET_PASSWORD"),
+    ("emulate --write new.toml --fault silence", FAILED, "--fault", "'silence'", "fixed., head., zoom."),
+    ("emulate --write new.toml --fault a.b", FAILED, "--fault", "'a.b'", "fixed., head., zoom."),
+    ("emulate --write new.toml --fault head.rust", FAILED, "--fault", "'head.rust'", "garbage", "silence"),
+    ("emulate --write new.toml --head 65536", USAGE, "--head", "'65536'"),
+    ("emulate --write new.toml --seconds 0", USAGE, "--seconds"),
+    ("emulate --rig sim.toml --write sim.toml", FAILED, "sim.toml: "),
+    ("emulate --write folder", FAILED, "folder: "),
+    ("emulate --write none/new.toml", FAILED, "none/new.toml: "),
+    ("emulate --write -", FAILED, "-: "),
+    # what shows and inspects
+    ("view --port 5", FAILED, "--port", "--browser"),
+    ("view --calibration good.json", FAILED, "--calibration", "--target"),
+    ("view --target dog", FAILED, "--target", "'dog'"),
+    ("view --rig hw.toml", FAILED, "hw.toml: backend"),
+    ("view --rig rig.toml --target bird", FAILED, "rig.toml: ", '[sim] targets = ["book", "bird"]'),
+    ("detect film.mp4", USAGE, "--target", "--csv"),
+    ("detect none.mp4 --target bird --csv new.csv", FAILED, "none.mp4"),
+    ("detect text.mp4 --target bird --csv new.csv", FAILED, "text.mp4"),
+    ("detect folder --target bird --csv new.csv", FAILED, "folder: "),
+    ("detect film.mp4 --target dog --csv new.csv", FAILED, "--target", "'dog'"),
+    (f"{DETECT} new.csv --rig none.toml", FAILED, "none.toml"),
+    (f"{DETECT} none/new.csv", FAILED, "none/new.csv"),
+    (f"{DETECT} new.csv --labels other.csv", FAILED, "other.csv", "frame, x_px"),
+    (f"{DETECT} new.csv --video new.txt", FAILED, "new.txt", ".mp4"),
+    (f"{DETECT} - --labels late.csv", FAILED, "--labels", "--csv"),
+    ("doctor --rig none.toml", FAILED, "none.toml"),
     ("doctor --rig typo.toml", FAILED, "typo.toml", "sim.scenery"),
+]
+# Messages that a newcomer meets first, word for word.
+FIRST = {
+    "": "the following arguments are required: COMMAND; see cotarget --help",
+    "calibrate": "one of the arguments --rig --from is required; see cotarget calibrate --help",
+    "follow --calibration good.json --rig none.toml --target book": (
+        "none.toml: no such file; give the path of a rig.toml"
+    ),
+    f"{TARGET} dog": "--target: unknown target 'dog'; the targets are: bird, book, person",
+    f"{TARGET} bird": 'rig.toml: the simulated scene has no bird; add it: [sim] targets = ["book", "bird"]',
+    "calibrate --rig hw.toml": (
+        "hw.toml: does not say how large the squares of your board are; measure ten of them, and say so in metres: "
+        "[board] square = 0.025"
+    ),
+    "calibrate --from single --fixed 'left*.png'": (
+        "plain photos need --zoom too: --fixed, --zoom, --board and --square"
+    ),
+    "board --out new.pdf --board 7x7": (
+        "--board: 7x7 looks the same upside down; one count must be odd and the other even, like 7x8"
+    ),
+    "stop --rig sim.toml": 'sim.toml: has no stop file; give one: [safety] stop_file = "stop"',
+    "view": "this machine has no display; --browser shows the scene in a web browser instead",
+    "replay none": "none: no such folder; give the folder of a recording",
+}
+OPENED = [
+    (f"{FOLLOW} --video out.xyz", FAILED, "out.xyz: ", ".mp4"),
+    (f"{OUT} --rig rig.toml --captures out.csv/x", FAILED, "out.csv/x: "),
+    (f"{OUT} --rig rig.toml --captures index", FAILED, "index: "),
 ]
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
+    """A folder with good rigs and calibrations, old results, and much that is no good."""
     folder = tmp_path_factory.mktemp("calls")
+    for name in ("folder", "index", "cut", "no_fixed", "no_zoom", "grey", "single"):
+        (folder / name).mkdir()
     for name, text in FILES.items():
         (folder / name).write_text(text)
-    save_calibration(folder / "good.json", true_calibration(RigConfig()))
+    good = true_calibration(RigConfig())
+    gamma = good.zoom_head.T_zoom0_fixed
+    wide_apart = RigidTransform.from_components(1000 * gamma.translation, gamma.rotation)
+    save_calibration(folder / "good.json", good)
     save_calibration(folder / "wide.json", true_calibration(RigConfig(), zoom_size=(640, 360)))
-    (folder / "folder").mkdir()
+    save_calibration(folder / "headless.json", true_calibration(RigConfig(), with_head=False))
+    save_calibration(folder / "millimetres.json", with_zoom_head(good, T_zoom0_fixed=wide_apart))
+    for name, camera in (("no_fixed", "zoom"), ("no_zoom", "fixed")):
+        cv2.imwrite(str(folder / name / "a.png"), board_photo())
+        write_index(folder / name, [capture("a.png", camera)])
+    for side in ("left", "right"):
+        for number in range(4):
+            cv2.imwrite(str(folder / "grey" / f"{side}{number}.png"), np.full((120, 160, 3), 128, np.uint8))
+        cv2.imwrite(str(folder / "single" / f"{side}1.png"), board_photo())
     bird_film(folder / "film.mp4", 5)
     return folder
 
 
-@pytest.mark.parametrize(
-    ("line", "status", "parts"), [(line, status, parts) for line, status, *parts in CALLS], ids=str
-)
-def test_a_wrong_call_ends_in_one_line(made, monkeypatch, capsys, line, status, parts):
+@pytest.fixture
+def folder(made, monkeypatch):
+    """It is the working folder, and nothing in it has changed afterwards."""
     monkeypatch.chdir(made)
+    for name in ("COTARGET_PASSWORD", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("LP_NUM_THREADS", "1")  # emulate sets it, and how long threads take turns, for its process
+    turns = sys.getswitchinterval()
     before = {path: path.stat().st_mtime_ns for path in made.rglob("*")}
+    yield made
+    assert {path: path.stat().st_mtime_ns for path in made.rglob("*")} == before
+    sys.setswitchinterval(turns)
+
+
+def check(capsys, line, status, *parts):
     ended, out, err = call(capsys, *shlex.split(line))
     assert (ended, out) == (status, "")
     [said] = err.splitlines()
-    assert said.startswith(f"cotarget {line.split()[0]}: ")
+    assert said.startswith(f"cotarget {line.split()[0]}: " if line and line != "dance" else "cotarget: ")
     for part in parts:
         assert part in said
-    assert {path: path.stat().st_mtime_ns for path in made.rglob("*")} == before
 
 
-def test_labels_of_another_film_are_an_error(made, monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(made)
-    status, out, err = call(capsys, *shlex.split(DETECT), tmp_path / "tracks.csv", "--labels", "late.csv")
-    assert (status, out) == (FAILED, "")
-    assert err == (
-        "cotarget detect: late.csv: no labelled frame is in the film, whose last one is 4; give the labels of this "
-        "film, with frames from 0\n"
-    )
+@pytest.mark.parametrize("call", CALLS, ids=lambda call: call[0])
+def test_a_wrong_call_ends_in_one_line_that_names_it(folder, capsys, call):
+    check(capsys, *call)
 
 
-def test_a_table_goes_to_stdout_and_the_summary_to_stderr(made, monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(made)
-    bird_film(tmp_path / "long.mp4", 60)
-    detect = ("detect", tmp_path / "long.mp4", "--target", "bird", "--csv")
-    assert call(capsys, *detect, tmp_path / "tracks.csv")[0] == 0
-    status, out, err = call(capsys, *detect, "-")
-    assert status == 0
-    assert out == (tmp_path / "tracks.csv").read_text()
-    assert '"frames": 60' in err
-    assert not (made / "-").exists()
+@pytest.mark.render
+@pytest.mark.parametrize("call", OPENED, ids=lambda call: call[0])
+def test_a_mistake_that_shows_with_the_rig_open_ends_in_one_line(folder, capsys, call):
+    check(capsys, *call)
+
+
+@pytest.mark.parametrize("line", FIRST)
+def test_what_a_newcomer_meets_first_is_said_in_these_words(folder, capsys, line):
+    _, _, said = call(capsys, *shlex.split(line))
+    assert said == f"{' '.join(['cotarget', *line.split()[:1]])}: {FIRST[line]}\n"
+
+
+def test_an_unknown_key_is_told_with_the_valid_ones(folder, capsys):
+    said = refused(capsys, "point", "--rig", "typo.toml")
+    assert said.startswith("cotarget point: typo.toml: unknown key 'sim.scenery'; valid here: T_head_zoom, ")
+
+
+@pytest.mark.wire
+@pytest.mark.render
+@pytest.mark.parametrize(
+    "command", [("emulate", "--write", "new.toml", "--seconds", "1", "--control"), ("view", "--browser", "--port")]
+)
+def test_a_port_that_is_taken_is_told(folder, capsys, command):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert port in refused(capsys, *command, port)
+
+
+def test_labels_of_another_film_are_an_error(folder, capsys, tmp_path):
+    assert "late.csv: " in refused(capsys, *shlex.split(DETECT), tmp_path / "tracks.csv", "--labels", "late.csv")

@@ -8,7 +8,7 @@ import pytest
 from cotarget.backends import load_config
 from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
-from tests.cli.test_commands import call, true_calibration
+from tests.support.commands import call, true_calibration
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from cotarget.calibration import load_calibration
 from cotarget.config import RigConfig
 from cotarget.emulators.emulation import FAULTS
 from cotarget.targeting import Reach, WantedSize, aim, point_at
-from tests.cli.test_commands import call
+from tests.support.commands import call
 from tests.support.emulated_rig import DEADLINE_S, PASSWORD, Watch, emulated, meanwhile, program, way
 
 pytestmark = [pytest.mark.wire, pytest.mark.render]

@@ -14,7 +14,7 @@ from cotarget.errors import CotargetError
 from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, Rig, ZoomState
-from tests.cli.test_commands import true_calibration
+from tests.support.commands import true_calibration
 from tests.support.rigs import guarded
 
 pytestmark = pytest.mark.render

@@ -14,7 +14,7 @@ import pytest
 from cotarget import cli
 from cotarget.board import board_points
 from cotarget.calibration import Covariance, HeldOut, Options, Rejected, View, calibrate_views, save_calibration
-from cotarget.cli.calibrating import summary
+from cotarget.cli.calibrating import calibration_summary
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.report import verdict
@@ -366,7 +366,7 @@ def test_more_placements_take_nothing_from_the_jitter_nor_from_a_lens_between_it
     assert what_stays(stops, between) == pytest.approx(doubt, rel=0.01)
     said = f"from {digits(np.degrees(at.rms))} to {digits(np.degrees(with_more_placements(shaky, at)))} degrees"
     assert any(said in item for item in advice(shaky, (at,), (), (), gather(shaky)))
-    told = summary(shaky, Path("c.json"))
+    told = calibration_summary(shaky, Path("c.json"))
     assert told["predicted_error_deg_with_10_more_placements"] == {
         "667 px": pytest.approx(np.degrees(with_more_placements(shaky, at)))
     }

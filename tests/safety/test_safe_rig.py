@@ -114,7 +114,7 @@ def test_every_command_is_done_within_the_limits_or_refused(step):
             head.log.clear()
             good = not math.isnan(pan) and not math.isnan(tilt) and (speed is None or speed > 0)
             if not good:
-                with pytest.raises(DeviceError, match="the head cannot"):
+                with pytest.raises(DeviceError, match="head"):
                     safe.move(pan, tilt, speed)
                 assert not head.log
                 continue
@@ -129,18 +129,9 @@ def test_every_command_is_done_within_the_limits_or_refused(step):
 def test_a_head_that_says_it_goes_beyond_the_limits_is_halted(said):
     rig = Devices()
     rig.head.move = lambda *a: said
-    with pytest.raises(DeviceError, match=r"was sent to pan 28\.648.* beyond the limits") as caught:
+    with pytest.raises(DeviceError, match=r"pan 28\.648"):
         guarded(rig, SafetyConfig(pan_deg=(-90.0, 90.0))).head.move(0.5, 0.1)
     assert rig.head.log == ["halt"]
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("angles", [(math.nan, 0.0), (0.0, math.nan)])
-def test_what_is_not_a_number_never_reaches_the_head(angles):
-    head = Head(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), 1.0, 1.0, 0.0))
-    with pytest.raises(DeviceError, match="cannot go to"):
-        guarded(Devices(head), SafetyConfig()).head.move(*angles)
-    assert not head.log
 
 
 def test_a_head_of_unlimited_speed_is_not_told_infinity():
@@ -155,34 +146,31 @@ def test_waiting_is_passed_on():
     assert rig.head.log[-1][3] is True
 
 
-def test_a_stale_frame_is_refused():
-    config = SafetyConfig(max_frame_age_s=0.5)
-    fresh = guarded(Devices(age=0.49), config).fixed
-    assert fresh.read().t == pytest.approx(4.51)
-    assert fresh.size == (2, 2)
-    with pytest.raises(StaleFrameError, match=r"the newest frame is 0\.51 s old; at most 0\.5 s") as caught:
-        guarded(Devices(age=0.51), config).fixed.read()
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize("camera", ["fixed", "zoom"])
-@pytest.mark.parametrize(("t", "newer_than", "message"), [
-    (4.4, None, r"the newest frame is 0\.60 s old; at most 0\.5 s is acted on \(CAMERA camera\)"),
-    (5.2, None, r"the CAMERA camera's frame is from 0\.20 s in the future"),
-    (9e9, 4.0, "in the future"),
-    (-math.inf, None, "inf s old"),
-    (math.nan, None, "nan s old"),
-    (4.9, 4.9, r"the CAMERA camera gave a frame of 4\.900 s for one after that time"),
-    (4.8, 4.9, r"the CAMERA camera gave a frame of 4\.800 s for one after that time"),
+@pytest.mark.parametrize(("t", "newer_than", "named"), [
+    (4.51, None, None),  # just fresh enough at 5.0 s
+    (4.51, 4.5, None),
+    (4.49, None, "0.51 s"),
+    (5.2, None, "0.20 s"),
+    (9e9, 4.0, "future"),
+    (-math.inf, None, "inf s"),
+    (math.nan, None, "nan s"),
+    (4.9, 4.9, "4.900 s"),
+    (4.8, 4.9, "4.800 s"),
 ])  # fmt: skip
-def test_neither_camera_gives_a_frame_that_cannot_be_acted_on(camera, t, newer_than, message):
+def test_neither_camera_gives_a_frame_that_cannot_be_acted_on(camera, t, newer_than, named):
     rig = Devices()
     reader = SimpleNamespace(size=(2, 2), read=lambda *a: Frame(np.zeros((2, 2, 3), np.uint8), t))
     setattr(rig, camera, reader)
-    safe = guarded(rig, SafetyConfig(max_frame_age_s=0.5))
-    with pytest.raises(StaleFrameError, match=message.replace("CAMERA", camera)) as caught:
-        getattr(safe, camera).read(newer_than)
-    assert "\n" not in str(caught.value)
+    safe = getattr(guarded(rig, SafetyConfig(max_frame_age_s=0.5)), camera)
+    assert safe.size == (2, 2)
+    if named is None:
+        assert safe.read(newer_than).t == t
+        return
+    with pytest.raises(StaleFrameError) as caught:
+        safe.read(newer_than)
+    assert named in str(caught.value)
+    assert f"{camera} camera" in str(caught.value)
 
 
 def test_a_still_may_be_old_when_it_arrives_but_not_older_than_its_request():
@@ -198,7 +186,7 @@ def test_a_still_may_be_old_when_it_arrives_but_not_older_than_its_request():
     exposed = 5.4
     assert safe.zoom.capture().t == 5.4
     exposed = 5.4  # once more the same, 2.6 s before it was asked for
-    with pytest.raises(StaleFrameError, match=r"the still is from 2\.60 s before it was asked for"):
+    with pytest.raises(StaleFrameError, match=r"2\.60 s"):
         safe.zoom.capture()
 
 
@@ -311,12 +299,13 @@ def test_stopping_an_unguarded_rig_halts_its_head_and_says_that_it_may_move_agai
     assert (rig.stopped, rig.clear()) == (None, None)
 
 
-@pytest.mark.parametrize(("soft", "message"), [
-    ({"pan_deg": (160.0, 170.0)}, r"safety\.pan_deg: \[160\.0, 170\.0\] leaves nothing .*\[-158\.9, 158\.9\]"),
-    ({"tilt_deg": (-90.0, -46.6)}, r"safety\.tilt_deg: \[-90\.0, -46\.6\] leaves nothing .*\[-46\.6, 31\.1\]"),
-    ({"pan_deg": (0.01, 0.04)}, r"safety\.pan_deg: \[0\.01, 0\.04\] leaves nothing"),  # between two steps of the head
+@pytest.mark.parametrize(("soft", "device"), [
+    ({"pan_deg": (160.0, 170.0)}, "[-158.9, 158.9]"),
+    ({"tilt_deg": (-90.0, -46.6)}, "[-46.6, 31.1]"),
+    ({"pan_deg": (0.01, 0.04)}, "[-158.9, 158.9]"),  # between two steps of the head
 ])  # fmt: skip
-def test_soft_limits_that_leave_nothing_are_refused(soft, message):
-    with pytest.raises(ConfigError, match=message) as caught:
+def test_soft_limits_that_leave_nothing_are_refused(soft, device):
+    with pytest.raises(ConfigError) as caught:
         guarded(Devices(), SafetyConfig(**soft))
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"safety.{next(iter(soft))}: ")
+    assert device in str(caught.value)

@@ -15,7 +15,7 @@ import tomli_w
 
 from cotarget.backends import load_config
 from cotarget.calibration import save_calibration
-from tests.cli.test_commands import true_calibration
+from tests.support.commands import true_calibration
 
 DEADLINE_S = 60.0  # for whatever must happen at all, on a machine that is busy with other things
 START_S = 120.0  # for an emulator to say where it listens

@@ -57,7 +57,7 @@ class DesktopWindow:
         handle.set_texts((None, None, sight.caption, None))
         whole = handle.viewport
         if whole is not None and whole.width > 0:
-            handle.set_images(_placed(list(sight.pictures.values()), whole.width, whole.height))
+            handle.set_images(placed_pictures(list(sight.pictures.values()), whole.width, whole.height))
         handle.sync()
 
     def close(self) -> None:
@@ -65,7 +65,7 @@ class DesktopWindow:
         self._handle.close()
 
 
-def _placed(pictures: list[Image], width: int, height: int) -> "list[tuple[mujoco.MjrRect, Image]]":
+def placed_pictures(pictures: list[Image], width: int, height: int) -> "list[tuple[mujoco.MjrRect, Image]]":
     """Place pictures in RGB one below the other at a window's right, scaled to fit."""
     placed, top = [], height - MARGIN_PX
     for picture in pictures:
