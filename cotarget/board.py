@@ -76,11 +76,7 @@ def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
 
 
 def check_board(board: BoardConfig) -> None:
-    """Refuse a board that looks the same upside down, or that needs more markers than the dictionary holds.
-
-    Raises:
-        ConfigError: there are too few or too many corners, or a chessboard's counts are both even or both odd.
-    """
+    """Refuse a board that looks the same upside down, or that needs more markers than the dictionary holds."""
     check_corners(board)
     if board.kind == "charuco":
         check_markers(board)
@@ -150,11 +146,7 @@ def marker_dictionary() -> "cv2.aruco.Dictionary":
 
 
 def check_markers(board: BoardConfig) -> None:
-    """Refuse a ChArUco board that needs more markers than the dictionary holds.
-
-    Raises:
-        ConfigError: the board has too many squares.
-    """
+    """Refuse a ChArUco board that needs more markers than the dictionary holds."""
     (columns, rows), most = board.corners, len(marker_dictionary().bytesList)
     if (columns + 1) * (rows + 1) // 2 > most:
         raise ConfigError(f"board.corners: {columns}x{rows} needs more than the {most} markers that there are")
@@ -164,9 +156,6 @@ def cells(board: BoardConfig) -> Cells:
     """Compute which cells of a board are dark, row by row.
 
     A cell is a square of a chessboard; each square of a ChArUco board has 20 x 20 cells.
-
-    Raises:
-        ConfigError: a ChArUco board needs more markers than the dictionary holds.
     """
     columns, rows = (n + 1 for n in board.corners)
     v, u = np.mgrid[:rows, :columns]

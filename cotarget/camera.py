@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from cotarget.errors import ConfigError
-from cotarget.geometry import Array, RigidTransform
+from cotarget.geometry import Array
 
 # Newton's method for the inverse distortion converges quadratically: 20 steps are ample wherever an inverse exists.
 UNDISTORT_STEPS = 20
@@ -50,10 +50,7 @@ class Intrinsics:
         return (np.array(self.size, dtype=float) - 1.0) / 2.0
 
     def project(self, x_camera: Array) -> Array:
-        """Project points into the image.
-
-        Args:
-            x_camera: points in the camera's frame [m], (..., 3).
+        """Project points of the camera's frame [m], (..., 3), into the image.
 
         Returns:
             Pixels (..., 2); nan for points behind the camera, and for points beyond the radius where the distortion
@@ -70,12 +67,9 @@ class Intrinsics:
         return np.where(valid[..., None], pixels, np.nan)
 
     def ray(self, pixel: Array) -> Array:
-        """Compute the ray through a pixel, scaled to z = 1, so that depth times ray is the point.
+        """Compute the rays through pixels (..., 2), scaled to z = 1, so that depth times ray is the point.
 
         The distortion is inverted by Newton's method.
-
-        Args:
-            pixel: (u, v) [px], (..., 2).
 
         Returns:
             Rays in the camera's frame, (..., 3); nan where no ray projects to that pixel.
@@ -102,12 +96,9 @@ class Intrinsics:
         return np.where(ok[..., None], ray, np.nan)
 
     def tangents(self, pixel: Array) -> tuple[Array, Array] | None:
-        """Undistort one pixel and differentiate the result.
+        """Undistort one pixel (u, v), (2,), and differentiate the result.
 
         Written in floats, which takes less than a tenth of the time that `ray` takes with arrays.
-
-        Args:
-            pixel: (u, v) [px], (2,).
 
         Returns:
             Tangents (x / z, y / z), (2,), and their derivative by the pixel [1/px], (2, 2); None where no ray projects
@@ -302,10 +293,6 @@ class ZoomLens:
             distortion=(k1, k2, p1, p2, k3),
         )
 
-    def to_pupil(self, nominal_px: float) -> RigidTransform:
-        """Compute the transform from the zoom frame at a nominal focal length [px] to that at the first zoom sample."""
-        return RigidTransform.from_translation([0.0, 0.0, self.pupil_at(nominal_px)])
-
     def pupil_at(self, nominal_px: float) -> float:
         """Interpolate the entrance pupil's shift forward since the first zoom sample [m]."""
         return 0.0 if len(self.stops) == 1 else float(self._values(nominal_px)[-1])
@@ -344,11 +331,7 @@ class ZoomLens:
         return nominal
 
     def resized(self, size: tuple[int, int]) -> "ZoomLens":
-        """Return the same lens for a stream scaled to another size; its nominal focal lengths scale with it.
-
-        Raises:
-            ConfigError: the aspect ratio differs.
-        """
+        """Return the same lens for a stream scaled to another size; its nominal focal lengths scale with it."""
         factor = size[0] / self.size[0]
         nominal, stops = tuple(n * factor for n in self.nominal_px), tuple(s.resized(size) for s in self.stops)
         return ZoomLens(nominal, stops, self.pupil)

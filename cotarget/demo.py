@@ -118,7 +118,6 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
         calibration = calibrate(
             rig,
             config.board,
-            pitch_mm=config.sim.zoom.pitch_mm,
             seed=seed,
             progress=lambda done, total, text: progress(done, total, f"calibrating: {text}"),
         )

@@ -22,19 +22,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 Array = npt.NDArray[np.float64]
 
-__all__ = ["FARTHEST_M", "Array", "RigidTransform", "Rotation", "angle_between", "pose", "pose_dict", "rot_x", "rot_y"]
+__all__ = ["FARTHEST_M", "Array", "RigidTransform", "Rotation", "angle_between", "pose", "pose_dict"]
 
 FARTHEST_M, WHOLE_TURN_DEG = 1e6, 360.0  # a configured pose beyond these is a mistake, such as a wrong unit
-
-
-def rot_x(angle: float) -> Rotation:
-    """Rotate about x by ``angle`` [rad]: a positive tilt turns +z towards -y, that is up (Eq. 8)."""
-    return Rotation.from_rotvec([angle, 0.0, 0.0])
-
-
-def rot_y(angle: float) -> Rotation:
-    """Rotate about y by ``angle`` [rad]: a positive pan turns +z towards +x, that is right (Eq. 8)."""
-    return Rotation.from_rotvec([0.0, angle, 0.0])
 
 
 def pose(translation: Sequence[float] | Array, rotvec_deg: Sequence[float] | Array) -> RigidTransform:

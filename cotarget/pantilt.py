@@ -23,7 +23,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from cotarget.errors import UnreachableError
-from cotarget.geometry import Array, RigidTransform, Rotation, angle_between, rot_y
+from cotarget.geometry import Array, RigidTransform, Rotation, angle_between
 
 
 @dataclass(frozen=True)
@@ -67,28 +67,21 @@ IDEAL_HEAD = HeadGeometry()
 
 
 def base_head(pan: float, tilt: float, head: HeadGeometry = IDEAL_HEAD) -> RigidTransform:
-    """Compute the forward kinematics T_base_head, the paper's P (Eq. 8 with dz and eps).
+    """Compute the forward kinematics T_base_head, the paper's P (Eq. 8 with dz and eps), from reported angles [rad].
 
-    T_base_head is the identity at true pan = tilt = 0.
-
-    Args:
-        pan: reported pan, positive turns the camera right [rad].
-        tilt: reported tilt, positive turns the camera up [rad].
-        head: geometry of the head.
+    Positive pan turns the camera right, positive tilt up. T_base_head is the identity at true pan = tilt = 0.
     """
     true_pan, true_tilt = (float(angle) for angle in head.true_angles(pan, tilt))
     offset = RigidTransform.from_translation([0.0, 0.0, head.axis_offset])
     tilting = RigidTransform.from_rotation(Rotation.from_rotvec(head.tilt_axis * true_tilt))
-    return RigidTransform.from_rotation(rot_y(true_pan)) * offset * tilting * offset.inv()
+    panning = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, true_pan, 0.0]))
+    return panning * offset * tilting * offset.inv()
 
 
 def towards(x_base: Array) -> tuple[float, float]:
-    """Compute the pan and tilt [rad] that point the z axis of an ideal head's platform at a target.
+    """Compute the pan and tilt [rad] that point the z axis of an ideal head's platform at a target x_base [m], (3,).
 
     This ignores T_head_zoom, the pose of the camera on the head.
-
-    Args:
-        x_base: target in the base's frame [m], (3,).
     """
     x, y, z = x_base
     return math.atan2(x, z), math.atan2(-y, math.hypot(x, z))
@@ -101,15 +94,7 @@ def zoom_fixed(
     T_zoom0_fixed: RigidTransform,
     head: HeadGeometry = IDEAL_HEAD,
 ) -> RigidTransform:
-    """Compute T_zoom_fixed, from the fixed camera to the moved zoom camera (Eq. 2).
-
-    Args:
-        pan: reported pan [rad].
-        tilt: reported tilt [rad].
-        T_head_zoom: the paper's T.
-        T_zoom0_fixed: the paper's Gamma.
-        head: geometry of the head.
-    """
+    """Compute T_zoom_fixed, from the fixed camera to the zoom camera moved by reported pan and tilt [rad] (Eq. 2)."""
     return T_head_zoom.inv() * base_head(pan, tilt, head).inv() * T_head_zoom * T_zoom0_fixed
 
 

@@ -40,11 +40,7 @@ class FixedCamera:
         return self.lens.project(x_fixed)
 
     def resized(self, size: tuple[int, int]) -> "FixedCamera":
-        """Return the same camera for a stream scaled to another size (width, height) [px].
-
-        Raises:
-            ConfigError: the aspect ratio differs.
-        """
+        """Return the same camera for a stream scaled to another size (width, height) [px]."""
         return FixedCamera(self.lens.resized(size))
 
 
@@ -77,15 +73,11 @@ class ZoomHead:
             raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
         if nominal_px is None:
             return self.T_head_zoom
-        return self.T_head_zoom * self.lens.to_pupil(nominal_px)
+        return self.T_head_zoom * RigidTransform.from_translation([0.0, 0.0, self.lens.pupil_at(nominal_px)])
 
     @cached_property
     def T_base_fixed(self) -> RigidTransform:
-        """Transform from the fixed camera to the base, T_head_zoom T_zoom0_fixed (Eq. 6).
-
-        Raises:
-            CalibrationError: no head was calibrated.
-        """
+        """Transform from the fixed camera to the base, T_head_zoom T_zoom0_fixed (Eq. 6)."""
         return self.hand_eye() * self.T_zoom0_fixed
 
     @cached_property
@@ -102,23 +94,12 @@ class ZoomHead:
         """Map a point from the fixed camera's frame to the base's, (3,) [m] (Eq. 6).
 
         It takes a third of the time of scipy's transform.
-
-        Raises:
-            CalibrationError: no head was calibrated.
         """
         x, y, z = x_fixed
         return np.asarray(self._base_fixed @ np.array((x, y, z, 1.0)))
 
     def T_fixed_zoom(self, pan: float, tilt: float) -> RigidTransform:
-        """Compute the pose of the zoom camera, at the shortest focal length, in the fixed camera's frame (Eq. 2).
-
-        Args:
-            pan: reported pan [rad].
-            tilt: reported tilt [rad].
-
-        Raises:
-            CalibrationError: no head was calibrated.
-        """
+        """Compute the zoom camera's pose, at the shortest focal length and reported pan and tilt [rad] (Eq. 2)."""
         return zoom_fixed(pan, tilt, self.hand_eye(), self.T_zoom0_fixed, self.axes).inv()
 
     def project(self, x_fixed: Array, pan: float, tilt: float, nominal_px: float) -> Array:
@@ -132,18 +113,11 @@ class ZoomHead:
 
         Returns:
             Pixels, (..., 2); nan behind the camera.
-
-        Raises:
-            CalibrationError: no head was calibrated.
         """
         x_head = base_head(pan, tilt, self.axes).inv().apply(self.T_base_fixed.apply(x_fixed))
         pupil = np.array([0.0, 0.0, self.lens.pupil_at(nominal_px)])
         return self.lens.at(nominal_px).project(self._T_zoom_head.apply(x_head) - pupil)
 
     def resized(self, size: tuple[int, int]) -> "ZoomHead":
-        """Return the same camera and head for a stream scaled to another size (width, height) [px].
-
-        Raises:
-            ConfigError: the aspect ratio differs.
-        """
+        """Return the same camera and head for a stream scaled to another size (width, height) [px]."""
         return replace(self, lens=self.lens.resized(size))

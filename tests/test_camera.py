@@ -90,12 +90,6 @@ def test_the_papers_focal_length():
     assert round(focal_for_size(234.0, 160.0, 10510.0)) == 7186  # with the exact range after centring
 
 
-def test_table_2_in_millimetres():
-    """Focal lengths in mm are px times pitch: 693, 692 at 0.009 mm and 684, 686 at 0.01 mm."""
-    assert [round(f * 0.009, 3) for f in (693, 692)] == [6.237, 6.228]
-    assert [round(f * 0.01, 3) for f in (684, 686)] == [6.84, 6.86]
-
-
 def test_depth_from_size_is_the_inverse_of_projection():
     assert depth_from_size(FIXED, 0.234, 686 * 0.234 / 10, MIDDLE, vertical=False) == pytest.approx(10)
     assert depth_from_size(FIXED, 1.75, 684 * 1.75 / 12, MIDDLE, vertical=True) == pytest.approx(12)

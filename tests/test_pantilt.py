@@ -85,9 +85,6 @@ def test_inverse_hits_random_targets_in_both_branches():
         turned = np.abs(np.exp(1j * solutions.pan) - np.exp(1j * pan[:, None]))
         turned += np.abs(np.exp(1j * solutions.tilt) - np.exp(1j * tilt[:, None]))
         found += np.count_nonzero(np.min(np.nan_to_num(turned, nan=9.0), axis=1) < SAME_ANGLES)
-    print(
-        f"worst miss of {RIGS * TARGETS} targets: {worst:.2e} degrees; {found} found at the angles they were made from"
-    )
     assert worst < MISS_DEG
     assert found >= MADE_FROM_FOUND * RIGS * TARGETS
 
@@ -186,11 +183,6 @@ def test_shortcut_without_solution_is_nan():
     T = pose([0.0, 0.0, 0.0], [0, 0, 0])
     near = shortcut(np.array([30.0, 0.0, 1.0]), RigidTransform.identity(), T, "table")
     assert np.isnan(near.pan)
-
-
-def test_zoom_fixed_is_gamma_at_home():
-    gamma, T = pose([-0.4, 0.03, 0.06], [1, -2, 3]), pose([0.02, -0.08, 0.05], [4, 5, 6])
-    np.testing.assert_allclose(zoom_fixed(0, 0, T, gamma).as_matrix(), gamma.as_matrix(), atol=ROUNDING)
 
 
 def test_target_brought_to_the_axis_lies_on_it():

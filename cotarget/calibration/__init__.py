@@ -1,4 +1,15 @@
-"""Calibration: boards and corners, intrinsics, stereo (Gamma), hand-eye (T), capture sessions and the file."""
+"""Calibration: boards and corners, intrinsics, stereo (Gamma), hand-eye (T), capture sessions and the file.
+
+Arguments that mean the same in all functions here:
+
+- points: the board's corners in its frame [m], (N, 3)
+- views: corners that were seen, with what the devices reported; see `View`
+- model: geometry of the rig, with the boards' poses where views are predicted; see `BundleModel`
+- free: blocks of parameters that a fit determines; see `Block`
+- sizes: image sizes (width, height) of "fixed" and "zoom" [px]
+- nominal, nominal_px: nominal focal length of the zoom lens, or one for each zoom sample [px]
+- progress: called with the number done, the total, and a text
+"""
 
 from cotarget.board import draw_board
 from cotarget.calibration.calibrate import calibrate_captures, calibrate_photos, calibrate_views

@@ -18,13 +18,14 @@ Measurements: docs/design-notes.md.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.calibration.model import BundleModel, View, stop_of
+from cotarget.calibration.model import BundleModel, View
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
@@ -47,54 +48,58 @@ HEAD_NAMES = {
     "scale": ("pan_scale", "tilt_scale"),
     "zero": ("pan_zero", "tilt_zero"),
 }
-WARP_NAMES = ("warp_x", "warp_y")
 
 
-def columns_of(free: Collection[Block], stops: int) -> dict[str, slice]:
-    """Map each free block to its slice of the shared parameters, for a lens of ``stops`` zoom samples."""
-    columns: dict[str, slice] = {}
-    width = 0
-    for name in EVERY_BLOCK:
-        if name in free:
-            size = len(_names(name, stops))
-            columns[name] = slice(width, width + size)
-            width += size
-    return columns
+@lru_cache
+def block_names(stops: int) -> dict[Block, list[str]]:
+    """Name the parameters of every block, in their order, for a lens of ``stops`` zoom samples; see `Covariance`."""
+    names: dict[Block, list[str]] = {
+        "fixed": [f"fixed.{name}" for name in LENS_NAMES],
+        "zoom": [f"zoom[{i}].{name}" for i in range(stops) for name in LENS_NAMES],
+        "pupil": [f"zoom[{i}].pupil" for i in range(1, stops)],
+        "gamma": [f"T_zoom0_fixed.{name}" for name in POSE_NAMES],
+        "hand": [f"T_head_zoom.{name}" for name in POSE_NAMES],
+        "head": [f"head.{name}" for name in HEAD_NAMES["head"]],
+        "warp": ["board.warp_x", "board.warp_y"],
+        "k3": ["fixed.k3"],
+        "scale": [f"head.{name}" for name in HEAD_NAMES["scale"]],
+        "zero": [f"head.{name}" for name in HEAD_NAMES["zero"]],
+    }
+    return names
 
 
 def parameter_names(free: Collection[Block], stops: int = 1) -> tuple[str, ...]:
-    """Name the parameters of the free blocks in their order; see `Covariance` for units."""
-    return tuple(name for block in columns_of(free, stops) for name in _names(block, stops))
+    """Name the parameters of the free blocks in their order."""
+    return tuple(name for block, names in block_names(stops).items() if block in free for name in names)
 
 
-def _names(block: str, stops: int) -> list[str]:
-    match block:
-        case "fixed":
-            return [f"fixed.{name}" for name in LENS_NAMES]
-        case "zoom":
-            return [f"zoom[{i}].{name}" for i in range(stops) for name in LENS_NAMES]
-        case "pupil":
-            return [f"zoom[{i}].pupil" for i in range(1, stops)]
-        case "gamma":
-            return [f"T_zoom0_fixed.{name}" for name in POSE_NAMES]
-        case "hand":
-            return [f"T_head_zoom.{name}" for name in POSE_NAMES]
-        case "k3":
-            return ["fixed.k3"]
-        case "warp":
-            return [f"board.{name}" for name in WARP_NAMES]
-        case _:
-            return [f"head.{name}" for name in HEAD_NAMES[block]]
+def columns_of(free: Collection[Block], stops: int) -> dict[str, slice]:
+    """Map each free block to its slice of the shared parameters."""
+    columns: dict[str, slice] = {}
+    width = 0
+    for block, names in block_names(stops).items():
+        if block in free:
+            columns[block] = slice(width, width + len(names))
+            width += len(names)
+    return columns
+
+
+def nudged(model: BundleModel, name: str, step: float) -> BundleModel:
+    """Return a model without boards in which one parameter differs by a step."""
+    block, names = next((block, names) for block, names in block_names(model.stops).items() if name in names)
+    steps = step * np.array([name == other for other in names], dtype=float)
+    return stepped(replace(model, boards={}), steps, np.empty((0, POSE_PARAMETERS)), (block,))
 
 
 def stepped(model: BundleModel, shared: Array, boards: Array, free: Collection[Block]) -> BundleModel:
     """Apply a step of the shared parameters (n,) and of the boards' poses (B, 6) to a model."""
     steps = {name: shared[columns] for name, columns in columns_of(free, model.stops).items()}
+    bend = steps.get("warp", np.zeros(2)).tolist()
     return BundleModel(
         boards=_all_moved(model.boards, boards),
-        fixed=None if model.fixed is None else _stepped_camera(model.fixed, steps),
+        fixed=_stepped_camera(model.fixed, steps),
         zoom_head=None if model.zoom_head is None else _stepped_head(model.zoom_head, steps),
-        warp=model.warp if "warp" not in steps else _pair(np.add(model.warp, steps["warp"])),
+        warp=(model.warp[0] + bend[0], model.warp[1] + bend[1]),
     )
 
 
@@ -131,40 +136,30 @@ def _stepped_head(head: ZoomHead, steps: Mapping[str, Array]) -> ZoomHead:
 
 def difference(model: BundleModel, reference: BundleModel, free: Collection[Block]) -> Array:
     """Compute the step of the shared parameters from the reference to the model, (n,), the inverse of `stepped`."""
-    parts: list[Array] = []
-    for block in columns_of(free, model.stops):
-        match block:
-            case "fixed":
-                assert model.fixed is not None
-                assert reference.fixed is not None
-                parts.append(_numbers(model.fixed.lens) - _numbers(reference.fixed.lens))
-            case "k3":
-                assert model.fixed is not None
-                assert reference.fixed is not None
-                parts.append(np.array([model.fixed.lens.distortion[4] - reference.fixed.lens.distortion[4]]))
-            case "warp":
-                parts.append(np.subtract(model.warp, reference.warp))
-            case _:
-                assert model.zoom_head is not None
-                assert reference.zoom_head is not None
-                parts.append(_head_difference(model.zoom_head, reference.zoom_head, block))
-    return np.concatenate(parts) if parts else np.zeros(0)
+    return np.concatenate([np.zeros(0), *(_difference(model, reference, b) for b in columns_of(free, model.stops))])
 
 
-def _head_difference(head: ZoomHead, reference: ZoomHead, block: str) -> Array:
-    """Compute the step of one block of the zoom camera and its head from the reference."""
+def _difference(model: BundleModel, reference: BundleModel, block: str) -> Array:
+    """Compute the step of one block from the reference to the model."""
+    lens, known_lens, head, known = model.fixed.lens, reference.fixed.lens, model.head, reference.head
     match block:
+        case "fixed":
+            return _numbers(lens) - _numbers(known_lens)
+        case "k3":
+            return np.array([lens.distortion[4] - known_lens.distortion[4]])
+        case "warp":
+            return np.subtract(model.warp, reference.warp)
         case "zoom":
-            pairs = zip(head.lens.stops, reference.lens.stops, strict=True)
+            pairs = zip(head.lens.stops, known.lens.stops, strict=True)
             return np.concatenate([_numbers(a) - _numbers(b) for a, b in pairs])
         case "pupil":
-            return np.subtract(head.lens.pupil, reference.lens.pupil)[1:]
+            return np.subtract(head.lens.pupil, known.lens.pupil)[1:]
         case "gamma":
-            return _pose_difference(head.T_zoom0_fixed, reference.T_zoom0_fixed)
+            return _pose_difference(head.T_zoom0_fixed, known.T_zoom0_fixed)
         case "hand":
-            return _pose_difference(head.hand_eye(), reference.hand_eye())
+            return _pose_difference(head.hand_eye(), known.hand_eye())
         case _:
-            return np.array([getattr(head.axes, k) - getattr(reference.axes, k) for k in HEAD_NAMES[block]])
+            return np.array([getattr(head.axes, k) - getattr(known.axes, k) for k in HEAD_NAMES[block]])
 
 
 def _pose_difference(T: RigidTransform, reference: RigidTransform) -> Array:
@@ -197,11 +192,6 @@ def _numbers(lens: Intrinsics) -> Array:
 def _bent(lens: Intrinsics, step: Array) -> Intrinsics:
     fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in _numbers(lens) + step)
     return Intrinsics(lens.size, (fx, fy), (cx, cy), (k1, k2, p1, p2, lens.distortion[4]))
-
-
-def _pair(values: Array) -> tuple[float, float]:
-    first, second = values
-    return float(first), float(second)
 
 
 # Reprojection of the corners
@@ -252,18 +242,11 @@ class Prediction:
 
 
 def batches_of(model: BundleModel, views: Sequence[View]) -> list[Batch]:
-    """Group views by lens; their placements must be among the model's boards.
-
-    Raises:
-        CalibrationError: there are views of a camera without a model.
-    """
+    """Group views by lens; their placements must be among the model's boards."""
     order = {number: i for i, number in enumerate(model.boards)}
     lenses: dict[int | None, list[int]] = {}
     for row, view in enumerate(views):
-        model.lens_of(view)
-        zoom = model.zoom_head
-        stop = None if view.camera == "fixed" or zoom is None else stop_of(zoom.lens.nominal_px, view)
-        lenses.setdefault(stop, []).append(row)
+        lenses.setdefault(model.stop_of(view), []).append(row)
     found = []
     for stop, rows in lenses.items():
         same = [views[row] for row in rows]
@@ -285,12 +268,8 @@ def batches_of(model: BundleModel, views: Sequence[View]) -> list[Batch]:
 
 def predict(model: BundleModel, batch: Batch, points: Array, free: Collection[Block]) -> Prediction:
     """Predict every corner of a batch with its derivatives; nan behind a camera."""
-    if batch.stop is None:
-        assert model.fixed is not None
-        lens, own = model.fixed.lens, "fixed"
-    else:
-        assert model.zoom_head is not None
-        lens, own = model.zoom_head.lens.stops[batch.stop], "zoom"
+    own = "fixed" if batch.stop is None else "zoom"
+    lens = model.fixed.lens if batch.stop is None else model.head.lens.stops[batch.stop]
     x, moved = _points_in_camera(model, batch, points)
     pixels, by_x, by_lens, by_k3 = _project(lens, x)
     columns = columns_of(free, model.stops)
@@ -336,9 +315,7 @@ def _points_in_camera(model: BundleModel, batch: Batch, points: Array) -> tuple[
     d_warp = M[:, None, :3, 2:3] * bulge[:, None]  # dy/dwarp, (v, N, 3, 2)
     if batch.stop is None:
         return y, {"board": d_board, "warp": d_warp}
-    head = model.zoom_head
-    assert head is not None
-    T = head.hand_eye()
+    head, T = model.head, model.head.hand_eye()
     R_g, R_h = head.T_zoom0_fixed.rotation.as_matrix(), T.rotation.as_matrix()
     t_h = T.translation
     R_p, t_p, A = base_heads(head.axes, batch.pan, batch.tilt)
@@ -373,12 +350,7 @@ def _bulge(points: Array) -> Array:
 
 
 def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Array, Array]:
-    """Compute T_base_head of many head poses at once (Eq. 8 with dz and eps).
-
-    Args:
-        head: geometry of the head.
-        pan: reported pan [rad], (v,).
-        tilt: reported tilt [rad], (v,).
+    """Compute T_base_head of reported pan and tilt [rad], (v,) each (Eq. 8 with dz and eps).
 
     Returns:
         Rotations (v, 3, 3) and translations (v, 3) of T_base_head, and the rotations of tilt alone (v, 3, 3).
@@ -595,11 +567,8 @@ class Problem:
     ) -> Equations:
         """Add up all views and the prior, with each view's own pan and tilt eliminated.
 
-        Args:
-            here: evaluation of the model.
-            grams: J^T W J of every batch, see `grams`.
-            penalty: variance of a coordinate over the squared jitter [px^2/rad^2]; infinite for an exact head.
-            variance: variance of a coordinate, which weighs the prior [px^2]; None for that of the evaluation.
+        The penalty is the variance of a coordinate over the squared jitter [px^2/rad^2], infinite for an exact head.
+        The variance [px^2] weighs the prior; None takes that of the evaluation.
         """
         boards = len(here.model.boards)
         n = len(parameter_names(self.free, here.model.stops))
@@ -719,7 +688,7 @@ def coordinate_variance(residuals: Array, parameters: float) -> float | None:
         parameters: number of fitted parameters, the boards' poses included.
 
     Returns:
-        Variance [px^2]; None where there are not more coordinates than parameters.
+        Variance [px^2]; None where there are no more coordinates than parameters.
     """
     freedom = residuals.size - parameters
     if freedom <= 0:
@@ -836,16 +805,9 @@ def fit(
 
 
 def information(model: BundleModel, views: Sequence[View], points: Array, free: Collection[Block]) -> Array:
-    """Compute the normal matrix that views would add, with the boards' poses eliminated.
+    """Compute the normal matrix (n, n) [1/px^2] that views would add, with the boards' poses eliminated.
 
-    Args:
-        model: model with the boards of the views.
-        views: planned or taken views; only which corners are seen matters.
-        points: the board's corners in its frame [m], (N, 3).
-        free: blocks that are free.
-
-    Returns:
-        Normal matrix (n, n) in the order of `parameter_names` [1/px^2].
+    Only which corners the views see matters.
     """
     model = replace(model, boards={number: model.boards[number] for number in sorted({v.board for v in views})})
     problem = Problem(batches_of(model, views), points, tuple(free), None, 0.0)

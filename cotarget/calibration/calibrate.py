@@ -8,7 +8,7 @@ the shortest focal length, and those of each zoom sample until the one before is
 import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -21,11 +21,10 @@ from cotarget.board import board_points, check_board
 from cotarget.calibration.captures import CaptureIndex, pair_photos, read_images, read_index
 from cotarget.calibration.corners import another_board, find_corners, guess_corners
 from cotarget.calibration.file import Calibration
-from cotarget.calibration.initialization import FEWEST_CORNERS
+from cotarget.calibration.initialization import FEWEST_CORNERS, sequential
 from cotarget.calibration.joint import (
     NO_PLACE,
     SAME_FOCAL,
-    expected_corners,
     fewest_stops,
     find_expected,
     fit_stop,
@@ -35,6 +34,7 @@ from cotarget.calibration.joint import (
     with_stop,
 )
 from cotarget.calibration.model import (
+    CAMERAS,
     DEFAULT_OPTIONS,
     BundleModel,
     CameraName,
@@ -44,16 +44,8 @@ from cotarget.calibration.model import (
     View,
     unseen,
 )
-from cotarget.calibration.sequential import sequential
-from cotarget.calibration.session import (
-    SETTLE,
-    SETTLE_LONG,
-    CaptureRecorder,
-    capture_session,
-    view_of,
-    with_stills,
-)
-from cotarget.config import BoardConfig, RigConfig
+from cotarget.calibration.session import CaptureRecorder, capture_session, with_stills
+from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array
 from cotarget.parallel import Progress
@@ -67,42 +59,18 @@ NOT_EXPECTED = "no part of the board is seen where it should be"
 TEACHING_VIEWS = 4  # first views of a zoom sample, after each of which it is fitted again
 
 
-@dataclass(frozen=True, eq=False)
-class FoundViews:
-    """Views found in images.
-
-    Attributes:
-        views: views found.
-        rejected: images without a usable board.
-        sizes: image size (width, height) of each camera [px].
-    """
-
-    views: tuple[View, ...]
-    rejected: tuple[Rejected, ...]
-    sizes: Mapping[CameraName, tuple[int, int]]
-
-
-def find_view(capture: Capture, board: BoardConfig) -> View | None:
-    """Find the board in a capture; None where no whole board is seen."""
-    corners = find_corners(capture.image, board)
-    return None if corners is None else view_of(capture, corners)
-
-
 def beyond_shortest(name: str, focal_px: float, shortest_px: float) -> Rejected:
     """Reject an image or view beyond the shortest nominal focal length, for a method that uses only that."""
     return Rejected(name, f"taken at {focal_px:.0f} px, not at the shortest focal length, {shortest_px:.0f} px")
 
 
 def find_views(
-    directory: Path, index: CaptureIndex, progress: Progress | None = None, *, options: Options = DEFAULT_OPTIONS
-) -> FoundViews:
+    directory: Path, index: CaptureIndex, progress: Progress | None, options: Options
+) -> tuple[list[View], list[Rejected], dict[CameraName, tuple[int, int]]]:
     """Find the boards in all images of an index; for the sequential method, only at the shortest focal length.
 
-    Args:
-        directory: folder of the images.
-        index: index of the images.
-        progress: called with the number done, the total, and a text.
-        options: options with which the views will be calibrated.
+    Returns:
+        Views, images without a usable board, and image size (width, height) of each camera [px].
 
     Raises:
         CalibrationError: an image is missing or malformed, none shows a board, or those at the shortest focal length
@@ -124,15 +92,15 @@ def find_views(
             else:
                 later.append(capture)
             continue
-        view = find_view(capture, index.board)
-        if view is None:
+        corners = find_corners(capture.image, index.board)
+        if corners is None:
             rejected.append(Rejected(str(capture.source), NO_BOARD.format(*index.board.corners)))
             if not views and len(rejected) == GUESSES and (other := _another_kind(capture, index.board)):
                 raise CalibrationError(f"{directory}: {other}")  # early, before all images are searched in vain
-        elif another_board(capture.image, index.board, view.corners_px):
+        elif another_board(capture.image, index.board, corners):
             rejected.append(Rejected(str(capture.source), TWO_BOARDS))
         else:
-            views.append(view)
+            views.append(capture.view(corners))
     if not views:
         raise CalibrationError(f"{directory}: {_why_none(directory, index, rejected)}")
     if later:
@@ -141,7 +109,7 @@ def find_views(
         more, lost = _find_parts(views, later, index.board, sizes, replace(options, folds=0))
         views += more
         rejected += lost
-    return FoundViews(tuple(views), tuple(rejected), sizes)
+    return views, rejected, sizes
 
 
 def _why_none(directory: Path, index: CaptureIndex, rejected: Sequence[Rejected]) -> str:
@@ -179,18 +147,17 @@ def _find_parts(
     points = board_points(board)
     solution = joint(views, points, sizes, stops_of(views), options)
     model, known = solution.model, list(solution.views)
-    blank = [(capture.image, view_of(capture, unseen(len(points)))) for capture in captures]
+    blank = [(capture.image, capture.view(unseen(len(points)))) for capture in captures]
     rejected = [Rejected(view.name, NO_PLACE) for _, view in blank if view.board not in model.boards]
     found: list[View] = []
     for nominal in stops_of([view for _, view in blank]):
-        assert model.zoom_head is not None
-        model = model.with_zoom_head(lens=with_stop(model.zoom_head.lens, nominal))
+        model = model.with_zoom_head(lens=with_stop(model.head.lens, nominal))
         here: list[View] = []
         waiting = [(image, view) for image, view in blank if same_focal(view, nominal) and view.board in model.boards]
         for learning in (True, False):  # images missed in the first round may be found once the sample is fitted
             missed = []
             for image, view in waiting:
-                corners = find_expected(image, board, expected_corners(model, view, points))
+                corners = find_expected(image, view, model, board)
                 if corners is None:
                     missed.append((image, view))
                     continue
@@ -219,7 +186,6 @@ PLACEMENTS = 30
 # Eight zoom samples follow a twelvefold zoom to some hundredths of a percent; six placements see each twelve times.
 STOPS, FAR_PLACEMENTS = 8, 6
 METHODS = ("joint", "sequential")
-CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 # Points this near to a line are on it: on the board by rounding [m], in the image because corners are rounded [px].
 LINE_M, LINE_PX = 1e-9, 1e-3
 
@@ -263,12 +229,10 @@ def calibrate_views(
     else:
         shortest, others = _at_shortest(views, nominal)
         solution = sequential(shortest, points, sizes, nominal[0] if nominal else None)
-    model = solution.model
-    assert model.fixed is not None
-    assert model.zoom_head is not None
+    head = solution.model.head
     return Calibration(
-        fixed=model.fixed,
-        zoom_head=model.zoom_head if solution.has_head else replace(model.zoom_head, T_head_zoom=None),
+        fixed=solution.model.fixed,
+        zoom_head=head if solution.has_head else replace(head, T_head_zoom=None),
         pitch_mm=pitch_mm,
         residuals=replace(solution.residuals, rejected=(*rejected, *others, *solution.residuals.rejected)),
         covariance=solution.covariance,
@@ -278,7 +242,7 @@ def calibrate_views(
         board=board,
         views=solution.views,
         provenance={
-            **_options_table(options),
+            **{"insist" if key == "regularize" else key: value for key, value in dataclasses.asdict(options).items()},
             "when": datetime.now(UTC).isoformat(timespec="seconds"),
             "cotarget": version("cotarget"),
             "opencv": cv2.__version__,
@@ -289,20 +253,15 @@ def calibrate_views(
     )
 
 
-def _options_table(options: Options) -> dict[str, Any]:
-    table = dataclasses.asdict(options)
-    return {"insist" if name == "regularize" else name: value for name, value in table.items()}  # the file's key
-
-
 def _check_views(views: Sequence[View], board: BoardConfig) -> None:
     """Refuse views whose corners do not belong to this board, or do not determine its pose."""
     columns, rows = board.corners
     points = board_points(board)
     for view in views:
         corners = view.corners_px
-        if corners.shape != (columns * rows, 2) or np.isinf(corners).any() or view.seen.sum() < FEWEST_CORNERS:
+        if corners.shape != (len(points), 2) or np.isinf(corners).any() or view.seen.sum() < FEWEST_CORNERS:
             raise CalibrationError(
-                f"{view.name}: has not the {columns * rows} finite corners of a {columns}x{rows} board, or the "
+                f"{view.name}: has not the {len(points)} finite corners of a {columns}x{rows} board, or the "
                 f"{FEWEST_CORNERS} of them that tell its pose"
             )
         if not tells_pose(view, points):
@@ -312,12 +271,7 @@ def _check_views(views: Sequence[View], board: BoardConfig) -> None:
 
 
 def tells_pose(view: View, points: Array) -> bool:
-    """Check whether the corners seen determine the board's pose: enough of them, and not all on one line.
-
-    Args:
-        view: view of a board.
-        points: the board's corners in its frame [m], (N, 3).
-    """
+    """Check whether the corners seen determine the board's pose: enough of them, and not all on one line."""
     seen = view.seen
     if np.count_nonzero(seen) < FEWEST_CORNERS:
         return False
@@ -408,16 +362,16 @@ def _calibrate_images(
     for camera in CAMERAS:
         if not any(capture.camera == camera for capture in index.captures):
             raise CalibrationError(f"{directory}: has no capture of the {camera} camera; both cameras are needed")
-    found = find_views(directory, index, progress, options=options)
+    views, unusable, sizes = find_views(directory, index, progress, options)
     if progress is not None:
         progress(len(index.captures), len(index.captures), "fitting")
     return calibrate_views(
-        found.views,
+        views,
         index.board,
-        found.sizes,
+        sizes,
         pitch_mm=index.pitch_mm,
         options=options,
-        rejected=(*rejected, *found.rejected),
+        rejected=(*rejected, *unusable),
         provenance={what: str(directory), "images": len(index.captures)},
     )
 
@@ -450,9 +404,6 @@ def calibrate(
     stops: int = STOPS,
     far_placements: int = FAR_PLACEMENTS,
     seed: int = 0,
-    pitch_mm: float | None = None,
-    settle: float | None = None,
-    config: RigConfig | None = None,
     options: Options = DEFAULT_OPTIONS,
 ) -> Calibration:
     """Drive a rig through a capture session, and calibrate it from the views.
@@ -469,10 +420,6 @@ def calibrate(
             be too far apart; 1 for the shortest alone.
         far_placements: number of further placements, far away, for the zoom samples beyond the first.
         seed: seed of the choice among possible placements.
-        pitch_mm: pixel size of the zoom camera's images [mm]; None for the one that the camera gives.
-        settle: time after head and board stand until an image counts [s]; None for a short one in a simulation, and a
-            long one in real time.
-        config: configuration stored beside the captures; None for that of the rig.
         options: options of the calibration.
 
     Raises:
@@ -481,11 +428,8 @@ def calibrate(
     """
     rig = with_stills(rig)
     board = opened_from(rig).board if board is None else board
-    pitch_mm = rig.spec.zoom.pitch_mm if pitch_mm is None else pitch_mm
-    if settle is None:
-        settle = SETTLE_LONG if rig.spec.real_time else SETTLE
     stops = _enough_stops(stops, rig.zoom.focal_range)
-    recorder = CaptureRecorder(rig, board, captures_dir, pitch_mm, settle, config or rig.config)
+    recorder = CaptureRecorder(rig, board, captures_dir)
     rng = np.random.default_rng(seed)
     capture_session(recorder, placements, rng, progress, stops=stops, far_placements=far_placements)
     provenance = {
@@ -500,7 +444,7 @@ def calibrate(
         recorder.views,
         board,
         {"fixed": rig.fixed.size, "zoom": rig.zoom.size},
-        pitch_mm=pitch_mm,
+        pitch_mm=rig.spec.zoom.pitch_mm,
         options=options,
         rejected=recorder.rejected,
         provenance=provenance | ({} if captures_dir is None else {"captures": str(captures_dir)}),

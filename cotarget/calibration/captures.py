@@ -9,14 +9,13 @@
   [px] and gets the one that the lens goes to; "present" asks for T_fixed_board and gets null.
 """
 
-import importlib.metadata
 import json
 import math
 import platform
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +23,7 @@ import cv2
 import numpy as np
 from annotated_types import Ge
 
-from cotarget.calibration.file import check_schema, read_json, write_board
+from cotarget.calibration.file import check_schema, read_object, write_board
 from cotarget.calibration.model import CameraName, Capture
 from cotarget.config import BoardConfig, RigConfig, WrittenBoard, config_table
 from cotarget.errors import CalibrationError, ConfigError
@@ -38,15 +37,11 @@ VERSIONS = ("numpy", "scipy", "opencv-python-headless")  # packages on which cor
 
 
 def write_session(directory: Path, config: RigConfig | None) -> None:
-    """Write session.json and an empty commands.jsonl.
-
-    Raises:
-        ConfigError: a file cannot be written.
-    """
+    """Write session.json and an empty commands.jsonl."""
+    versions = {"cotarget": version("cotarget"), "python": platform.python_version()}
     table = {
         "schema": SCHEMA,
-        "versions": {"cotarget": version("cotarget"), "python": platform.python_version()}
-        | {name: _version(name) for name in VERSIONS},
+        "versions": versions | {name: _version(name) for name in VERSIONS},
         "config": None if config is None else config_table(config),
     }
     write_atomically(directory / SESSION, json.dumps(table, indent=2).encode() + b"\n")
@@ -54,11 +49,7 @@ def write_session(directory: Path, config: RigConfig | None) -> None:
 
 
 def write_command(directory: Path, t: float, do: str, asked: Any, got: Any = None) -> None:
-    """Append a command to commands.jsonl.
-
-    Raises:
-        ConfigError: the file cannot be written.
-    """
+    """Append a command to commands.jsonl."""
     path = directory / COMMANDS
     try:
         with path.open("a", encoding="utf-8") as file:
@@ -69,8 +60,8 @@ def write_command(directory: Path, t: float, do: str, asked: Any, got: Any = Non
 
 def _version(package: str) -> str | None:
     try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:  # such as another build of OpenCV
+        return version(package)
+    except PackageNotFoundError:  # such as another build of OpenCV
         return None
 
 
@@ -140,17 +131,8 @@ class IndexTable:
 NO_IMAGE: Image = np.zeros((0, 0, 3), np.uint8)
 
 
-def file_name(capture: Capture, number: int) -> str:
-    """Make the name of a capture's image from its number in the session, its camera and its placement."""
-    return f"{number:04d}_{capture.camera}_board{capture.board:02d}.png"
-
-
 def write_image(path: Path, image: Image) -> None:
-    """Write a PNG atomically.
-
-    Raises:
-        ConfigError: the file cannot be written.
-    """
+    """Write a PNG atomically."""
     ok, data = cv2.imencode(".png", image, PNG_OPTIONS)
     if not ok:
         raise CalibrationError(f"{path}: OpenCV cannot encode the image")
@@ -158,24 +140,10 @@ def write_image(path: Path, image: Image) -> None:
 
 
 def write_index(directory: Path, index: CaptureIndex) -> None:
-    """Write index.json atomically.
-
-    Raises:
-        ConfigError: the file cannot be written.
-    """
+    """Write index.json atomically."""
+    keys = ("camera", "board", "pan", "tilt", "focal_px", "t")
     rows = ",\n    ".join(
-        json.dumps(
-            {
-                "file": capture.source,
-                "camera": capture.camera,
-                "board": capture.board,
-                "pan": capture.pan,
-                "tilt": capture.tilt,
-                "focal_px": capture.focal_px,
-                "t": capture.t,
-            },
-            allow_nan=False,
-        )
+        json.dumps({"file": capture.source} | {key: getattr(capture, key) for key in keys}, allow_nan=False)
         for capture in index.captures
     )
     text = (
@@ -195,7 +163,7 @@ def read_index(directory: Path) -> CaptureIndex:
     path = directory / INDEX
     if not directory.is_dir():
         raise CalibrationError(f"{directory}: no such folder; give a folder of captures")
-    table = read_json(path, "give a folder of captures, as cotarget calibrate --captures DIR makes one")
+    table = read_object(path, "give a folder of captures, as cotarget calibrate --captures DIR makes one")
     check_schema(path, table, SCHEMA)
     try:
         index = validate(IndexTable, table, "")
@@ -247,11 +215,6 @@ def read_image(path: Path) -> Image:
 def pair_photos(directory: Path, fixed_glob: str, zoom_glob: str) -> tuple[list[Capture], list[str]]:
     """Pair plain photos of two cameras by the last number in their names.
 
-    Args:
-        directory: folder of the photos.
-        fixed_glob: pattern of the fixed camera's files, like 'left*.jpg'.
-        zoom_glob: pattern of the zoom camera's files.
-
     Returns:
         Captures with empty images and the number as the placement; and the names of files without a partner.
 
@@ -277,11 +240,7 @@ def pair_photos(directory: Path, fixed_glob: str, zoom_glob: str) -> tuple[list[
 
 
 def matching(directory: Path, pattern: str) -> list[Path]:
-    """List the files that match a pattern, sorted, without hidden ones, such as the rest of an interrupted write.
-
-    Raises:
-        CalibrationError: the pattern is invalid.
-    """
+    """List the files that match a pattern, sorted, without hidden ones, such as the rest of an interrupted write."""
     try:
         return sorted(path for path in directory.glob(pattern) if path.is_file() and not path.name.startswith("."))
     except (ValueError, NotImplementedError):

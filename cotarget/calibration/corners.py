@@ -9,7 +9,8 @@ away from the viewer. The square diagonally outside the first corner is black.
 - `find_near` finds a part of a chessboard, as the zoom camera sees it at long focal lengths. The colours alone do not
   show which part, so the corners are numbered by a prediction that is good to a fraction of a square.
 
-Measurements: docs/design-notes.md.
+In the functions below, ``grey`` is an image (H, W), ``grid`` the column and row of every corner on the board, (N, 2),
+and ``H`` a homography from squares of the board to pixels. Measurements: docs/design-notes.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -99,16 +100,9 @@ class FoundCorners:
 
 
 def search_near(grey: Image, grid: Array, predicted: Array, look: Look) -> FoundCorners | None:
-    """Search for corners near their predictions, correct the predictions by what is found, and repeat.
+    """Search for corners near their predictions (N, 2) [px], correct the predictions by what is found, and repeat.
 
-    Args:
-        grey: grey image, (H, W).
-        grid: column and row of every corner, (N, 2).
-        predicted: predicted corners, (N, 2) [px]; nan for corners without a prediction.
-        look: distances at which corners are examined.
-
-    Returns:
-        Corners found; None where they are fewer than six, or too close together.
+    None where fewer than six are found, or where they are too close together.
     """
     H = homography(grid, predicted)
     if H is None:
@@ -140,15 +134,7 @@ def grid_of(board: BoardConfig) -> Array:
 
 
 def homography(grid: Array, pixels: Array) -> Array | None:
-    """Fit the homography from squares to pixels by least squares over the finite pixels.
-
-    Args:
-        grid: corners on the board [squares], (n, 2).
-        pixels: corners in the image, (n, 2) [px]; nan for unknown ones.
-
-    Returns:
-        Homography (3, 3); None where fewer than six corners are known.
-    """
+    """Fit a homography to the finite pixels (n, 2) by least squares; None where there are fewer than six."""
     finite = np.isfinite(pixels).all(axis=1)
     if np.count_nonzero(finite) < FEWEST_CORNERS:
         return None
@@ -199,14 +185,9 @@ def are_corners(grey: Image, pixels: Array, grid: Array, H: Array, look: Look) -
 
 
 def contrast(grey: Image, pixels: Array, grid: Array, H: Array, share: float) -> Array:
-    """Compute the contrast between the two bright and the two dark squares around each corner.
+    """Compute the contrast between the two bright and the two dark squares around candidate corners (N, 2) [px].
 
-    Args:
-        grey: grey image, (H, W).
-        pixels: candidate corners, (N, 2).
-        grid: column and row of the expected corners, (N, 2).
-        H: approximate homography from squares to pixels, for the size and slant of the squares.
-        share: distance from the corner along both axes at which the squares are sampled [squares].
+    The squares are sampled at a share of a square from the corner along both axes.
 
     Returns:
         Level of the darker bright square less that of the brighter dark one, (N,) [grey levels]; nan for nan pixels.
@@ -224,12 +205,6 @@ def goes_on(grey: Image, grid: Array, seen: Mask, H: Array) -> bool:
     """Check whether corners continue beyond an edge of the board.
 
     If so, what is seen is another part of the board, or a part of a larger one.
-
-    Args:
-        grey: grey image, (H, W).
-        grid: column and row of the board's corners, (N, 2).
-        seen: corners that give the board's usual contrast, (N,).
-        H: homography from squares to pixels.
     """
     usual = np.median(contrast(grey, through(H, grid[seen]), grid[seen], H, PLAIN.inside))
     last_column, last_row = grid.max(axis=0)
@@ -304,11 +279,6 @@ IGNORED_MARGIN, CORRECTION = 0.3, 1.0
 def find_charuco(grey: Image, board: BoardConfig, *, thorough: bool = True) -> Array | None:
     """Find the corners of a ChArUco board, whole or in part.
 
-    Args:
-        grey: grey image, (H, W).
-        board: a ChArUco board.
-        thorough: True to search the enlarged image even where the plain one shows no markers.
-
     Returns:
         Corners row by row, (columns * rows, 2) [px], nan for those not seen; None where fewer than six are seen, or all
         in one row or column.
@@ -364,24 +334,24 @@ SMALLEST_SHARE = 0.85
 def find_near(image: Image, board: BoardConfig, predicted_px: Array) -> Array | None:
     """Find the corners of a board seen in part, near their predictions.
 
-    Args:
-        image: image, (H, W, 3) BGR, or grey (H, W).
-        board: the board.
-        predicted_px: predicted corners row by row, (columns * rows, 2) [px], off by less than a third of a square and
-            by nearly the same at all corners. They may be nan, or outside the image.
+    A prediction is off by less than a third of a square, and by nearly the same at all corners. It may be nan, or
+    outside the image.
 
     Returns:
         Corners row by row, (columns * rows, 2) [px], nan for those not seen; None where fewer than six are seen, or
         where they are not surely numbered as predicted.
     """
-    grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    grey, grid = _grey(image), grid_of(board)
     if board.kind == "charuco":  # the markers number the corners better than any prediction
         return find_charuco(grey, board)
-    grid, predicted = grid_of(board), np.asarray(predicted_px, dtype=float).reshape(-1, 2)
-    found = search_near(grey, grid, predicted, PLAIN)
-    if found is None or not _as_predicted(grey, grid, predicted, found):
+    found = search_near(grey, grid, predicted_px, PLAIN)
+    if found is None or not _as_predicted(grey, grid, predicted_px, found):
         return None
     return found.rounded()
+
+
+def _grey(image: Image) -> Image:
+    return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
 
 
 def _as_predicted(grey: Image, grid: Array, predicted: Array, found: FoundCorners) -> bool:
@@ -429,7 +399,7 @@ def find_corners(image: Image, board: BoardConfig, *, thorough: bool = True) -> 
         Corners from the board's first, row by row, (columns * rows, 2) [px]; None where no whole chessboard is seen.
         Corners of a ChArUco board that are not seen are nan; None where fewer than six are seen, or all in one line.
     """
-    grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    grey = _grey(image)
     if board.kind == "charuco":
         return find_charuco(grey, board, thorough=thorough)
     for level in _pyramid(grey):
@@ -458,13 +428,8 @@ def another_board(image: Image, board: BoardConfig, corners_px: Array) -> bool:
     """Check whether an image shows a second board of the same kind and size, by the fastest finder alone.
 
     A large image is searched for a second chessboard at a fraction of its size only, as `find_corners` begins.
-
-    Args:
-        image: image, (H, W, 3) BGR, or grey (H, W).
-        board: the board.
-        corners_px: corners of the first board, (columns * rows, 2) [px], nan for corners that are not seen.
     """
-    grey = np.array(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    grey = _grey(image).copy()
     H = homography(grid_of(board), corners_px)
     if H is None:
         return False
@@ -479,14 +444,10 @@ def another_board(image: Image, board: BoardConfig, corners_px: Array) -> bool:
 def guess_corners(image: Image) -> tuple[int, int] | None:
     """Guess the counts of inner corners of any chessboard that an image shows, for an error message.
 
-    Args:
-        image: image, (H, W, 3) BGR, or grey (H, W).
-
     Returns:
         Columns and rows, the larger count first; None where no chessboard is surely seen.
     """
-    grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-    grey = _pyramid(grey)[0]
+    grey = _pyramid(_grey(image))[0]
     ok, _, layout = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER)
     if not ok:
         return None
@@ -542,9 +503,7 @@ def _is_whole(grey: Image, corners_px: Array, board: BoardConfig) -> bool:
 def _refine(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array:
     """Move the corners to the saddle points of the image, (N, 2) [px]."""
     half = max(SMALLEST_WINDOW_PX, round(WINDOW_SHARE * smallest_spacing(corners_px, corners)))
-    start = corners_px.astype(np.float32).reshape(-1, 1, 2)
-    refined = cv2.cornerSubPix(grey, start, (half, half), (-1, -1), SUBPIX_CRITERIA)
-    return np.asarray(refined, dtype=float).reshape(-1, 2)
+    return refined(grey, corners_px, np.ones(len(corners_px), dtype=bool), half)
 
 
 def _sector_based(flags: int) -> "BoardFinder":

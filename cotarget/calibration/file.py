@@ -97,9 +97,18 @@ class Calibration:
         """Read a calibration.json.
 
         Raises:
-            CalibrationError: the file is missing or malformed; the message names the file and the key.
+            CalibrationError: the file is missing, malformed or no calibration; the message names the file and the key.
         """
-        return load_calibration(Path(path))
+        path = Path(path)
+        table = read_object(path, WANTED)
+        if not (table.keys() & OWN_KEYS):
+            what = next((f", but {what}" for keys, what in OTHERS if table.keys() >= keys), "")
+            raise CalibrationError(f"{path}: is no calibration{what}; {WANTED}")
+        check_schema(path, table, SCHEMA)
+        try:
+            return validate(CalibrationTable, table, "").calibration()
+        except (ConfigError, CalibrationError) as error:
+            raise CalibrationError(f"{path}: {error}") from None
 
     def save(self, path: Path | str) -> None:
         """Write a calibration.json atomically.
@@ -108,19 +117,25 @@ class Calibration:
             ConfigError: the file cannot be written.
             CalibrationError: the calibration holds a number that is not finite.
         """
-        save_calibration(Path(path), self)
+        try:
+            text = _readable(_table(self))
+        except ValueError:
+            raise CalibrationError(f"{path}: not written: the calibration holds a number that is not finite") from None
+        write_atomically(Path(path), text.encode())
 
 
-def read_json(path: Path, wanted: str) -> Table:
-    """Read a JSON object from a file.
+def load_calibration(path: Path) -> Calibration:
+    """Read a calibration.json; see `Calibration.load`."""
+    return Calibration.load(path)
 
-    Args:
-        path: file to read.
-        wanted: advice for the message, where the file holds something else.
 
-    Raises:
-        CalibrationError: the file is missing, or is not a JSON object; the message says what it is where possible.
-    """
+def save_calibration(path: Path, calibration: Calibration) -> None:
+    """Write a calibration.json; see `Calibration.save`."""
+    calibration.save(path)
+
+
+def read_object(path: Path, wanted: str) -> Table:
+    """Read a JSON object from a file."""
 
     def refuse(constant: str) -> None:
         raise CalibrationError(f"{path}: holds the number {constant}, which is not finite")
@@ -149,11 +164,7 @@ def _is_toml(text: str) -> bool:
 
 
 def check_schema(path: Path, table: Table, schema: int) -> None:
-    """Refuse a file of another schema version.
-
-    Raises:
-        CalibrationError: the file has another schema number, or none.
-    """
+    """Refuse a file of another schema version."""
     if "schema" not in table:
         raise CalibrationError(f"{path}: missing key 'schema'; this version reads schema {schema}")
     if table["schema"] != schema or isinstance(table["schema"], bool):
@@ -175,7 +186,7 @@ Distortion = Annotated[tuple[Coefficient, Coefficient, Coefficient, Coefficient,
 
 
 @model
-class LensTable:
+class IntrinsicsTable:
     """Intrinsics without the image's size."""
 
     fx: FocalPx
@@ -197,7 +208,7 @@ class LensTable:
 
 
 @model
-class FixedTable(LensTable):
+class FixedTable(IntrinsicsTable):
     """The fixed camera."""
 
     size: Size
@@ -207,7 +218,7 @@ class FixedTable(LensTable):
 
 
 @model
-class StopTable(LensTable):
+class StopTable(IntrinsicsTable):
     """A zoom sample."""
 
     nominal_px: FocalPx
@@ -353,15 +364,7 @@ class CalibrationTable:
 
 
 def check_covariance(covariance: Covariance, stops: int) -> None:
-    """Refuse a matrix that is no covariance, and parameters that the rig does not have.
-
-    Args:
-        covariance: covariance of a calibration.
-        stops: number of zoom samples of its lens.
-
-    Raises:
-        CalibrationError: the covariance is invalid; the message names the key in the file.
-    """
+    """Refuse a matrix that is no covariance, and parameters that the rig does not have."""
     names, C = covariance.parameters, covariance.matrix
     known = parameter_names(EVERY_BLOCK, stops)
     if unknown := [name for name in names if name not in known]:
@@ -394,40 +397,9 @@ OTHERS = (
 )
 
 
-def save_calibration(path: Path, calibration: Calibration) -> None:
-    """Write calibration.json atomically.
-
-    Raises:
-        ConfigError: the file cannot be written.
-        CalibrationError: the calibration holds a number that is not finite.
-    """
-    try:
-        text = _readable(_table(calibration))
-    except ValueError:
-        raise CalibrationError(f"{path}: not written: the calibration holds a number that is not finite") from None
-    write_atomically(path, text.encode())
-
-
-def load_calibration(path: Path) -> Calibration:
-    """Read calibration.json.
-
-    Raises:
-        CalibrationError: the file is missing, malformed or no calibration; the message names the file and the key.
-    """
-    table = read_json(path, WANTED)
-    if not (table.keys() & OWN_KEYS):
-        raise CalibrationError(f"{path}: is no calibration{_what(table)}; {WANTED}")
-    check_schema(path, table, SCHEMA)
-    try:
-        return validate(CalibrationTable, table, "").calibration()
-    except (ConfigError, CalibrationError) as error:
-        raise CalibrationError(f"{path}: {error}") from None
-
-
 def _table(calibration: Calibration) -> dict[str, Any]:
     """Make the JSON object of a calibration."""
-    head = calibration.zoom_head
-    covariance = calibration.covariance
+    head, covariance = calibration.zoom_head, calibration.covariance
     return {
         "schema": SCHEMA,
         "fixed": {"size": list(calibration.fixed.size), **_write_intrinsics(calibration.fixed.lens)},
@@ -435,7 +407,7 @@ def _table(calibration: Calibration) -> dict[str, Any]:
             "size": list(head.lens.size),
             "stops": [
                 {"nominal_px": float(nominal), **_write_intrinsics(stop), "pupil": float(pupil)}
-                for nominal, stop, pupil in zip(*_columns(head.lens), strict=True)
+                for nominal, stop, pupil in zip(head.lens.nominal_px, head.lens.stops, head.lens.pupil, strict=True)
             ],
         },
         "T_zoom0_fixed": pose_dict(head.T_zoom0_fixed),
@@ -462,11 +434,6 @@ def _table(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _what(table: Table) -> str:
-    """Describe a file that is no calibration, by its keys; empty where it is not recognised."""
-    return next((f", but {what}" for keys, what in OTHERS if table.keys() >= keys), "")
-
-
 def write_board(board: BoardConfig) -> dict[str, Any]:
     """Make the JSON object of a board."""
     return {"kind": board.kind, "corners": list(board.corners), "square": board.square}
@@ -485,10 +452,6 @@ def _readable(table: dict[str, Any]) -> str:
         else:
             lines.append(f'  "{key}": {json.dumps(value, allow_nan=False)}')
     return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def _columns(lens: ZoomLens) -> tuple[tuple[float, ...], tuple[Intrinsics, ...], tuple[float, ...]]:
-    return lens.nominal_px, lens.stops, lens.pupil
 
 
 def _write_intrinsics(camera: Intrinsics) -> dict[str, Any]:

@@ -105,13 +105,7 @@ class MotionFit:
 
 
 def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> HandEyeProblem:
-    """Pose the problem A X = X B, with rotation and translation as one group each.
-
-    Args:
-        A: motions of the hand, stacked.
-        B: motions of the camera, stacked.
-        independent: number of independent motions among them.
-    """
+    """Pose the problem A X = X B of stacked motions, with rotation and translation as one group each."""
     R_A, one = A.rotation.as_matrix(), np.eye(3)
     share = independent / len(A)
 
@@ -145,12 +139,8 @@ def pose_problem(
 ) -> HandEyeProblem:
     """Pose the problem T_camera_board = X^-1 T_base_hand^-1 Z, with Z = T_base_board of each placement.
 
-    Residuals are in the camera's frame, turned so that z is the line of sight to the board.
-
-    Args:
-        T_base_hand: poses of the hand, stacked.
-        T_camera_board: poses of the board, stacked.
-        owners: index of each pose's placement, (n,), from 0.
+    Residuals are in the camera's frame, turned so that z is the line of sight to the board. The poses are stacked; each
+    belongs to the placement of index ``owners``, (n,).
     """
     look = _turn_to_z(T_camera_board.translation)
     hand_inv = T_base_hand.inv()
@@ -226,7 +216,7 @@ def regularized(problem: HandEyeProblem, found: MotionFit) -> MotionFit:
     return _result(problem, state, taken, found.used, free)
 
 
-def stepped(transforms: RigidTransform, step: Array) -> RigidTransform:
+def _stepped(transforms: RigidTransform, step: Array) -> RigidTransform:
     """Apply a step (6 * transforms,) to every transform: R <- exp(w) R, t <- t + d."""
     step = step.reshape(-1, 6)
     return RigidTransform.from_components(
@@ -259,7 +249,7 @@ def _descend(
         step = np.concatenate([x_step, -through[:, :6] @ x_step - through[:, 6]])
         freedom = _taken(WJ, J, inverse, through[:, :6], N)
         turn = float(np.abs(step.reshape(-1, 6)[:, :3]).max())
-        state = stepped(state, step * min(1.0, LONGEST_TURN / max(turn, LONGEST_TURN)))
+        state = _stepped(state, step * min(1.0, LONGEST_TURN / max(turn, LONGEST_TURN)))
         if step @ N @ step < (ROUGHLY if robust else CONVERGED) ** 2 and (not free or np.abs(x_step).max() < CONVERGED):
             break
     return state, sigma, freedom / problem.share
@@ -396,10 +386,6 @@ def motions(
     poses_base_head: Sequence[RigidTransform], poses_zoom_board: Sequence[RigidTransform]
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
     """Make the motions of head and camera between all pairs of views of one placement (Eq. 3).
-
-    Args:
-        poses_base_head: T_base_head of each view.
-        poses_zoom_board: T_zoom_board of each view.
 
     Returns:
         A: T_head_head' = T_base_head^-1 T_base_head', and B: T_zoom_zoom' = T_zoom_board T_zoom_board'^-1.

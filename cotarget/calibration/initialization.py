@@ -1,16 +1,18 @@
-"""Initial estimates for the fits: intrinsics of each camera, board poses, Gamma and T.
+"""Calibration step by step: intrinsics of each camera, board poses, Gamma and T.
 
 - `calibrate_camera`: intrinsics of one camera (Zhang 2000, by OpenCV).
 - `place_boards`: pose of every placement. One view of a flat board has two poses that explain it about equally,
   mirrored at the line of sight; a view by the other camera or from another head pose decides.
 - `rough_gamma`, `stereo`: Gamma from placements that both cameras see.
 - `rough_hand`: T from the motions of head and camera.
+- `sequential`: these steps one after the other, as in the paper's Table 1; kept for comparison.
 
-Nothing is assumed of the head's geometry, the order of the views or the cameras' mounting.
+The joint method starts from these estimates. Nothing is assumed of the head's geometry, the order of the views or the
+cameras' mounting.
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,7 +20,7 @@ import numpy as np
 
 from cotarget.calibration.bundle import Fit, fit, predict_pixels, robust_sigma
 from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye_from_motions
-from cotarget.calibration.model import BundleModel, CameraName, Rejected, View, stop_of
+from cotarget.calibration.model import BundleModel, CameraName, Rejected, Residuals, Solution, View
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
@@ -40,15 +42,7 @@ def calibrate_camera(
 ) -> tuple[Intrinsics, Fit]:
     """Fit one camera's intrinsics: focal lengths, principal point, k1, k2, p1, p2; every view's pose is free.
 
-    Args:
-        camera: name of the camera.
-        views: its views, all at one focal length.
-        points: the board's corners in its frame [m], (N, 3).
-        size: image size (width, height) [px].
-        start: start of the fit; None for `rough_intrinsics`.
-
-    Returns:
-        Intrinsics, and the fit.
+    The views are at one focal length. The fit starts from ``start``, or from `rough_intrinsics`.
 
     Raises:
         CalibrationError: too few views, or OpenCV finds no camera that explains them.
@@ -60,24 +54,20 @@ def calibrate_camera(
     lens = start or rough_intrinsics(camera, views, points, size)
     alone = [replace(view, camera="fixed", board=i) for i, view in enumerate(views)]
     boards = {i: board_pose(lens, view.corners_px, points) for i, view in enumerate(views)}
-    result = fit(BundleModel(boards=boards, fixed=FixedCamera(lens)), alone, points, {"fixed"})
-    assert result.model.fixed is not None
+    result = fit(BundleModel(boards, FixedCamera(lens)), alone, points, {"fixed"})
     return result.model.fixed.lens, result
 
 
 def rough_intrinsics(camera: CameraName, views: Sequence[View], points: Array, size: tuple[int, int]) -> Intrinsics:
-    """Estimate intrinsics with equal focal lengths and k1 alone from a few views.
-
-    Raises:
-        CalibrationError: OpenCV finds no camera that explains the views.
-    """
+    """Estimate intrinsics with equal focal lengths and k1 alone from a few views."""
     picked = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, STARTING_VIEWS).round().astype(int))]
+    middle = (np.array(size) - 1) / 2
     try:
         _, K, distortion, _, _ = cv2.calibrateCamera(
             [points[view.seen].astype(np.float32) for view in picked],
             [view.corners_px[view.seen].astype(np.float32) for view in picked],
             size,
-            np.array([[1.0, 0, (size[0] - 1) / 2], [0, 1.0, (size[1] - 1) / 2], [0, 0, 1.0]]),
+            np.array([[1.0, 0, middle[0]], [0, 1.0, middle[1]], [0, 0, 1.0]]),
             np.zeros(5),
             flags=START_FLAGS,
         )
@@ -87,21 +77,12 @@ def rough_intrinsics(camera: CameraName, views: Sequence[View], points: Array, s
         raise CalibrationError(
             f"{camera} camera: no intrinsics explain its {len(views)} views; tilt the board in varying directions"
         )
-    k = [float(value) for value in np.ravel(distortion)[:5]]
-    return Intrinsics(
-        size=size,
-        focal_px=(float(K[0, 0]), float(K[1, 1])),
-        center_px=(float(K[0, 2]), float(K[1, 2])),
-        distortion=(k[0], k[1], k[2], k[3], k[4]),
-    )
+    k1, k2, p1, p2, k3 = np.ravel(distortion)[:5].tolist()
+    return Intrinsics(size, (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2])), (k1, k2, p1, p2, k3))
 
 
 def board_pose(lens: Intrinsics, corners_px: Array, points: Array) -> RigidTransform:
-    """Estimate the board's pose in a camera's frame, T_camera_board, from one view.
-
-    Raises:
-        CalibrationError: no pose explains the corners.
-    """
+    """Estimate the board's pose in a camera's frame, T_camera_board, from one view."""
     points, corners_px = _seen(points, corners_px)
     ok, rotvec, translation = cv2.solvePnP(
         points, corners_px, lens.matrix, np.array(lens.distortion), flags=cv2.SOLVEPNP_IPPE
@@ -111,35 +92,29 @@ def board_pose(lens: Intrinsics, corners_px: Array, points: Array) -> RigidTrans
     rotvec, translation = cv2.solvePnPRefineLM(
         points, corners_px, lens.matrix, np.array(lens.distortion), rotvec, translation
     )
-    return RigidTransform.from_components(np.ravel(translation), Rotation.from_rotvec(np.ravel(rotvec)))
+    return _transform(rotvec, translation)
 
 
 def pose_candidates(lens: Intrinsics, corners_px: Array, points: Array) -> list[RigidTransform]:
-    """Find the one or two poses T_camera_board that explain a flat board's corners about equally, the better first.
-
-    Raises:
-        CalibrationError: no pose explains the corners.
-    """
+    """Find the one or two poses T_camera_board that explain a flat board's corners about equally, the better first."""
     points, corners_px = _seen(points, corners_px)
     _, rotvecs, translations, _ = cv2.solvePnPGeneric(
         points, corners_px, lens.matrix, np.array(lens.distortion), flags=cv2.SOLVEPNP_IPPE
     )
-    found = [
-        RigidTransform.from_components(np.ravel(t), Rotation.from_rotvec(np.ravel(r)))
-        for r, t in zip(rotvecs, translations, strict=True)
-        if np.isfinite(r).all() and np.isfinite(t).all()
-    ]
+    pairs = zip(rotvecs, translations, strict=True)
+    found = [_transform(r, t) for r, t in pairs if np.isfinite(r).all() and np.isfinite(t).all()]
     if not found:
         raise CalibrationError("no pose of the board explains its corners")
     return found
 
 
-def _seen(points: Array, corners_px: Array) -> tuple[Array, Array]:
-    """Select the points that are seen, and their corners.
+def _transform(rotvec: Array, translation: Array) -> RigidTransform:
+    """Convert a pose from OpenCV."""
+    return RigidTransform.from_components(np.ravel(translation), Rotation.from_rotvec(np.ravel(rotvec)))
 
-    Raises:
-        CalibrationError: they are too few for a pose.
-    """
+
+def _seen(points: Array, corners_px: Array) -> tuple[Array, Array]:
+    """Select the points that are seen, and their corners."""
     seen = np.isfinite(corners_px[:, 0])
     if np.count_nonzero(seen) < FEWEST_CORNERS:
         raise CalibrationError(f"{np.count_nonzero(seen)} corners of the board do not determine its pose")
@@ -154,19 +129,10 @@ ASKED_VIEWS = 2  # views of a placement whose candidate poses are tried on all o
 def place_boards(model: BundleModel, views: Sequence[View], points: Array) -> BundleModel:
     """Choose the pose of every placement: of the candidates from its views, the one that fits all its views best.
 
-    Args:
-        model: model with at least rough intrinsics, Gamma and T.
-        views: views of any placements.
-        points: the board's corners in its frame [m], (N, 3).
-
-    Returns:
-        The model with the boards of these placements and no others.
+    The model has at least rough intrinsics, Gamma and T. It is returned with the boards of these placements alone.
     """
-    placements: dict[int, list[View]] = defaultdict(list)
-    for view in views:
-        placements[view.board].append(view)
     boards = {}
-    for number, same in placements.items():
+    for number, same in by_placement(views).items():
         # The view of each camera that shows most corners; the candidates of the two cameras differ.
         by_camera = {view.camera: view for view in sorted(same, key=lambda view: int(view.seen.sum()))}
         candidates = [T for view in list(by_camera.values())[:ASKED_VIEWS] for T in _suggested(model, view, points)]
@@ -175,15 +141,21 @@ def place_boards(model: BundleModel, views: Sequence[View], points: Array) -> Bu
     return replace(model, boards=boards)
 
 
+def by_placement(views: Iterable[View]) -> dict[int, list[View]]:
+    """Group views by the number of their placement."""
+    placements: dict[int, list[View]] = defaultdict(list)
+    for view in views:
+        placements[view.board].append(view)
+    return placements
+
+
 def _suggested(model: BundleModel, view: View, points: Array) -> list[RigidTransform]:
     """Find the candidates of T_fixed_board from one view."""
-    poses = pose_candidates(model.lens_of(view), view.corners_px, points)
-    if view.camera == "fixed":
+    poses, stop = pose_candidates(model.lens_of(view), view.corners_px, points), model.stop_of(view)
+    if stop is None:
         return poses
-    head = model.zoom_head
-    assert head is not None
-    pupil = RigidTransform.from_translation([0.0, 0.0, head.lens.pupil[stop_of(head.lens.nominal_px, view)]])
-    T_fixed_zoom = head.T_fixed_zoom(view.pan, view.tilt) * pupil
+    pupil = RigidTransform.from_translation([0.0, 0.0, model.head.lens.pupil[stop]])
+    T_fixed_zoom = model.head.T_fixed_zoom(view.pan, view.tilt) * pupil
     return [T_fixed_zoom * T for T in poses]
 
 
@@ -244,15 +216,7 @@ def stereo(model: BundleModel, pairs: Sequence[View], points: Array) -> Fit:
 
 
 def check_pairs(steps: Steps, together_px: float) -> None:
-    """Refuse images of two cameras without a head that fit far worse together than each camera's alone.
-
-    Args:
-        steps: calibration of each camera by itself.
-        together_px: rms of both cameras with one Gamma [px].
-
-    Raises:
-        CalibrationError: the cameras contradict each other.
-    """
+    """Refuse images of two cameras without a head whose rms with one Gamma is far larger than each camera's alone."""
     alone_px = max(steps.fixed_fit.rms_px, steps.zoom_fit.rms_px)
     if not steps.has_head and together_px > max(CONTRADICTION * alone_px, CONTRADICTION_FLOOR_PX):
         raise CalibrationError(
@@ -286,23 +250,19 @@ def one_camera(
 
     Returns:
         Intrinsics, the fit, the views used, and the views left out.
-
-    Raises:
-        CalibrationError: too few views, or no camera explains them.
     """
     mine = tuple(view for view in views if view.camera == camera)
     lens, result = calibrate_camera(camera, mine, points, size)
     typical = np.array([robust_sigma(r[view.seen]) for r, view in zip(result.residuals, mine, strict=True)]) * 2**0.5
     limit = max(OUTLIER_FACTOR * float(np.median(typical)), OUTLIER_FLOOR_PX)
     good = tuple(view for view, value in zip(mine, typical, strict=True) if value <= limit)
-    if len(good) == len(mine):
-        return lens, result, mine, []
     rejected = [
         Rejected(view.name, f"its corners are {value:.2f} px off, where {limit:.2f} px is the limit")
         for view, value in zip(mine, typical, strict=True)
         if value > limit
     ]
-    lens, result = calibrate_camera(camera, good, points, size, start=lens)
+    if rejected:
+        lens, result = calibrate_camera(camera, good, points, size, start=lens)
     return lens, result, good, rejected
 
 
@@ -320,19 +280,11 @@ def of_both(views: Sequence[View]) -> tuple[View, ...]:
 def rough_gamma(model: BundleModel, views: Sequence[View], points: Array) -> RigidTransform:
     """Estimate Gamma from placements that both cameras see at any head pose: the candidate nearest to all others.
 
-    Args:
-        model: model with both cameras, and with T where the head has moved.
-        views: views of such placements.
-        points: the board's corners in its frame [m], (N, 3).
+    The model has both cameras, and T where the head has moved.
     """
-    assert model.fixed is not None
-    assert model.zoom_head is not None
-    T, axes = model.zoom_head.hand_eye(), model.zoom_head.axes
-    by_board: dict[int, list[View]] = defaultdict(list)
-    for view in views:
-        by_board[view.board].append(view)
+    T, axes = model.head.hand_eye(), model.head.axes
     candidates = []
-    for same in by_board.values():
+    for same in by_placement(views).values():
         boards = [board_pose(model.fixed.lens, v.corners_px, points) for v in same if v.camera == "fixed"]
         for view in same:
             if view.camera == "fixed":
@@ -355,42 +307,72 @@ def _most_central(candidates: Sequence[RigidTransform], scale: float) -> RigidTr
 def rough_hand(model: BundleModel, views: Sequence[View], points: Array, *, regularize: bool = False) -> RigidTransform:
     """Estimate T from all motions within each placement, by Park and Martin's method.
 
-    Args:
-        model: model with the zoom camera.
-        views: views of any placements.
-        points: the board's corners in its frame [m], (N, 3).
-        regularize: True to take the smallest turn and shift where the motions leave T undetermined.
+    With ``regularize`` it is the smallest turn and shift where the motions leave T undetermined.
 
     Raises:
         CalibrationError: the motions do not determine T, or contradict each other.
     """
-    A, B = head_motions(model, views, points)
-    return solve_hand_eye_from_motions(A, B, regularize=True).X if regularize else park_martin(A, B)
-
-
-def head_motions(
-    model: BundleModel, views: Sequence[View], points: Array
-) -> tuple[list[RigidTransform], list[RigidTransform]]:
-    """Make the motions A of the head and B of the camera between all zoom views of each placement (Eq. 3).
-
-    Raises:
-        CalibrationError: no placement is seen from two head poses.
-    """
-    assert model.zoom_head is not None
-    placements: dict[int, list[View]] = defaultdict(list)
-    for view in views:
-        if view.camera == "zoom":
-            placements[view.board].append(view)
     A: list[RigidTransform] = []
     B: list[RigidTransform] = []
-    for same in placements.values():
-        heads = [base_head(view.pan, view.tilt, model.zoom_head.axes) for view in same]
+    for same in by_placement(view for view in views if view.camera == "zoom").values():
+        heads = [base_head(view.pan, view.tilt, model.head.axes) for view in same]
         boards = [board_pose(model.lens_of(view), view.corners_px, points) for view in same]
-        for more, motion in zip((A, B), motions(heads, boards), strict=True):
-            more.extend(motion)
+        a, b = motions(heads, boards)
+        A, B = A + a, B + b
     if not A:
         raise CalibrationError(
             "hand-eye: no placement of the board is seen by the zoom camera from two poses of the head; "
             "leave the board where it is while the head turns"
         )
-    return A, B
+    return solve_hand_eye_from_motions(A, B, regularize=True).X if regularize else park_martin(A, B)
+
+
+# The sequential method
+
+
+def sequential(
+    views: Sequence[View], points: Array, sizes: Mapping[CameraName, tuple[int, int]], nominal_px: float | None = None
+) -> Solution:
+    """Calibrate a rig step by step, from zoom views at one focal length.
+
+    1. Intrinsics of each camera by itself, the zoom camera at its shortest focal length.
+    2. Gamma = T_zoom0_fixed from the placements that both cameras see at pan = tilt = 0.
+    3. T = T_head_zoom from the motions of head and camera, A T = T B (Eqs. 3, 4); then a fit of T, the axis offset dz
+       and the squareness eps to the corners.
+
+    Each step holds the results of earlier ones, so errors add up, and the normal matrices of the steps miss most of the
+    uncertainty. The method therefore gives no covariance.
+
+    Raises:
+        CalibrationError: the views do not determine the rig; the message says what is missing.
+    """
+    steps = both_cameras(views, points, sizes, nominal_px)
+    pairs = pairs_at_home(steps.views)
+    if not pairs:
+        raise CalibrationError(
+            "stereo: no placement of the board is seen by both cameras at pan = tilt = 0, which the sequential method "
+            "needs; the joint method does not"
+        )
+    stereo_fit = stereo(steps.model, pairs, points)
+    check_pairs(steps, stereo_fit.rms_px)
+    model = steps.model.with_zoom_head(T_zoom0_fixed=stereo_fit.model.head.T_zoom0_fixed)
+    zoom_views = [view for view in steps.views if view.camera == "zoom"]
+    handeye_rms = None
+    if steps.has_head:
+        model = model.with_zoom_head(T_head_zoom=rough_hand(model, zoom_views, points))
+        model = place_boards(model, steps.views, points)
+        hand_fit = fit(model, zoom_views, points, {"hand", "head"})
+        model, handeye_rms = replace(model, zoom_head=hand_fit.model.zoom_head), hand_fit.rms_px
+    else:
+        model = place_boards(model, of_both(steps.views), points)
+    residuals = Residuals(
+        fixed_rms_px=steps.fixed_fit.rms_px,
+        zoom_rms_px=steps.zoom_fit.rms_px,
+        stereo_rms_px=stereo_fit.rms_px,
+        handeye_rms_px=handeye_rms,
+        fixed_views=len(steps.views) - len(zoom_views),
+        zoom_views=len(zoom_views),
+        pairs=len({view.board for view in pairs}),
+        rejected=steps.rejected,
+    )
+    return Solution(model, residuals, steps.views, steps.has_head)

@@ -22,6 +22,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from cotarget.board import board_points
 from cotarget.calibration.bundle import (
     ALL_BLOCKS,
     MEDIAN_TO_SIGMA,
@@ -92,10 +93,7 @@ def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> fl
     With the variance of the corners profiled out, the likelihood of a jitter needs only the normal equations of the fit
     without jitter (Patterson and Thompson 1971; Harville 1977).
 
-    Args:
-        found: a fit with or without jitter; the jitter in it affects only the weights of its corners.
-        points: the board's corners in its frame [m], (N, 3).
-        prior: prior of the fit.
+    The fit may have assumed some jitter already, which affects only the weights of its corners.
 
     Returns:
         Standard deviation of each axis [rad]; 0 where the corners give no evidence of jitter.
@@ -230,8 +228,7 @@ def with_stop(lens: ZoomLens, nominal_px: float) -> ZoomLens:
 
 def lens_prior(model: BundleModel) -> Prior:
     """Make the prior of the zoom samples beyond the first, from `PUPIL_SIGMA` and `BENT_SIGMAS`."""
-    assert model.zoom_head is not None
-    lens = model.zoom_head.lens
+    lens = model.head.lens
     sigmas: dict[str, float] = {}
     stops = []
     for i, (stop, nominal) in enumerate(zip(lens.stops, lens.nominal_px, strict=True)):
@@ -244,32 +241,16 @@ def lens_prior(model: BundleModel) -> Prior:
 
 
 def fit_stop(model: BundleModel, number: int, views: Sequence[View], points: Array) -> BundleModel:
-    """Fit one zoom sample to views at it; every other parameter of the model is held.
+    """Fit one zoom sample, of which the model has a first guess; every other parameter of the model is held.
 
-    The boards' poses are free during the fit, and are returned as they were.
-
-    Args:
-        model: model with the boards of the views' placements and a first guess of the zoom sample.
-        number: index of the zoom sample.
-        views: zoom views at that sample, and fixed views of the same placements.
-        points: the board's corners in its frame [m], (N, 3).
+    The views are those of the zoom camera at that sample, and of the fixed camera of the same placements. The boards'
+    poses are free during the fit, and are returned as they were.
     """
     known = lens_prior(model)
     own = f"zoom[{number}]."  # without a prior the other samples, which have no views here, do not move
     prior = Prior(known.reference, {name: sigma for name, sigma in known.sigmas.items() if name.startswith(own)})
     found = fit(model, views, points, ("zoom", "pupil"), prior=prior)
     return replace(found.model, boards=model.boards)
-
-
-def expected_corners(model: BundleModel, view: View, points: Array) -> Array:
-    """Predict the corners of a view's board, (N, 2) [px]; nan behind the camera.
-
-    Args:
-        model: model with the board's pose and a zoom sample at the view's focal length.
-        view: the view; its corners are not used.
-        points: the board's corners in its frame [m], (N, 3).
-    """
-    return predict_pixels(model, [view], points)[0]
 
 
 def expected_inside(expected_px: Array, size: tuple[int, int]) -> Array:
@@ -279,8 +260,12 @@ def expected_inside(expected_px: Array, size: tuple[int, int]) -> Array:
         return np.asarray(low & (expected_px <= np.array(size) - 1 - INSIDE_PX).all(axis=-1))
 
 
-def find_expected(image: Image, board: BoardConfig, expected_px: Array) -> Array | None:
-    """Find a board, whole or in part, whose corners are expected at (N, 2) [px]; None where it is not found surely."""
+def find_expected(image: Image, view: View, model: BundleModel, board: BoardConfig) -> Array | None:
+    """Find a board, whole or in part, where a model with its pose expects it; None where it is not found surely.
+
+    The corners of the view are not used.
+    """
+    expected_px = predict_pixels(model, [view], board_points(board))[0]
     inside = expected_inside(expected_px, (image.shape[1], image.shape[0]))
     found = None
     if inside.all():
@@ -293,20 +278,14 @@ def find_expected(image: Image, board: BoardConfig, expected_px: Array) -> Array
 
 
 def check_stops(model: BundleModel) -> None:
-    """Refuse a lens whose true focal length does not grow with the nominal one.
-
-    Raises:
-        CalibrationError: two zoom samples contradict each other.
-    """
-    assert model.zoom_head is not None
-    lens = model.zoom_head.lens
-    focal = [stop.focal_px[0] for stop in lens.stops]
-    for i, (a, b) in enumerate(itertools.pairwise(focal)):
+    """Refuse a lens whose true focal length does not grow with the nominal one."""
+    lens = model.head.lens
+    for (n, one), (m, other) in itertools.pairwise(zip(lens.nominal_px, lens.stops, strict=True)):
+        a, b = one.focal_px[0], other.focal_px[0]
         if b <= a:
-            n = lens.nominal_px
             raise CalibrationError(
-                f"zoom lens: the true focal length comes out as {a:.0f} px at {n[i]:.0f} px and {b:.0f} px at "
-                f"{n[i + 1]:.0f} px by the device's account; check that the lens stood still and was where it said"
+                f"zoom lens: the true focal length comes out as {a:.0f} px at {n:.0f} px and {b:.0f} px at {m:.0f} px "
+                "by the device's account; check that the lens stood still and was where it said"
             )
 
 
@@ -354,8 +333,8 @@ def joint(
 
     Args:
         views: views of both cameras, those of the zoom camera at any zoom sample.
-        points: the board's corners in its frame [m], (N, 3).
-        sizes: image sizes (width, height) of both cameras [px].
+        points: the board's corners.
+        sizes: image sizes of both cameras.
         nominal_px: nominal focal lengths of the zoom samples [px], increasing; empty where the lens reports none.
         options: options of the calibration.
 
@@ -397,8 +376,10 @@ def joint(
         result, wrong, left_out = _cleaned(again, points, prior)
     rejected += left_out
     check_pairs(steps, rms(result.residuals))
-    if not options.regularize and (text := undetermined(result)):
-        raise CalibrationError(text)
+    names, focal = parameter_names(result.free, result.model.stops), result.model.focal_px
+    open_ = weak_directions(result.normal, names, result.variance or 0.0, focal)
+    if not options.regularize and len(open_):
+        raise CalibrationError(name_directions(names, open_, focal))
     covariance = covariance_of(result)
     held_out = None
     widened = K3_WIDENED if "k3" in result.free else 1.0
@@ -421,13 +402,6 @@ def joint(
     )
 
 
-def undetermined(found: Fit) -> str:
-    """Describe what a fit leaves undetermined and what to add; empty where it determines everything."""
-    names = parameter_names(found.free, found.model.stops)
-    focal = found.model.focal_px
-    return name_directions(names, weak_directions(found.normal, names, found.variance or 0.0, focal), focal)
-
-
 def _known(
     model: BundleModel, start: BundleModel, blocks: Sequence[Block], options: Options, warp_sigma: float
 ) -> Prior:
@@ -441,8 +415,7 @@ def _known(
     if model.stops > 1:
         lens = lens_prior(model)
         known, sigmas = lens.reference, {**sigmas, **lens.sigmas}
-    assert known.zoom_head is not None
-    reference = start.with_zoom_head(lens=known.zoom_head.lens)
+    reference = start.with_zoom_head(lens=known.head.lens)
     if options.regularize:
         names = [
             name for name in parameter_names(blocks, model.stops) if not name.startswith(("fixed.", "zoom[", "board."))
@@ -463,7 +436,6 @@ def _all_stops(
     """
     model, used, rejected = found.model, list(found.views), []
     for number, nominal in enumerate(nominal_px[1:], start=1):
-        assert model.zoom_head is not None
         at_stop = [v for v in views if v.camera == "zoom" and stop_of(nominal_px, v) == number]
         here = [v for v in at_stop if v.board in model.boards]
         rejected += [Rejected(v.name, NO_PLACE) for v in at_stop if v.board not in model.boards]
@@ -474,7 +446,7 @@ def _all_stops(
             continue
         seen_too = {view.board for view in here}
         with_fixed = [view for view in used if view.camera == "fixed" and view.board in seen_too]
-        start = model.with_zoom_head(lens=with_stop(model.zoom_head.lens, nominal))
+        start = model.with_zoom_head(lens=with_stop(model.head.lens, nominal))
         model = fit_stop(start, start.stops - 1, [*with_fixed, *here], points)
         used += here
     return model, used, rejected
@@ -538,11 +510,7 @@ def _without_wrong_corners(found: Fit, points: Array, prior: Prior) -> tuple[Fit
 
 
 def _with_jitter(found: Fit, points: Array, prior: Prior) -> Fit:
-    """Estimate the head's jitter and fit again with it, in turn until both settle.
-
-    Raises:
-        CalibrationError: the jitter is larger than any head's.
-    """
+    """Estimate the head's jitter and fit again with it, in turn until both settle."""
     if "hand" not in found.free:
         return found
     for _ in range(JITTER_ROUNDS):
@@ -575,7 +543,7 @@ def _with_k3_where_needed(found: Fit, points: Array, prior: Prior) -> tuple[Fit,
 
     freely, _ = fitted(found, K3_WIDE)
     covariance = covariance_of(freely)
-    if covariance is None or freely.model.fixed is None:
+    if covariance is None:
         return found, prior
     k3, sigma = freely.model.fixed.lens.distortion[4], covariance.sigma("fixed.k3")
     return fitted(freely, float(np.sqrt(k3**2 - sigma**2))) if abs(k3) > K3_SIGMAS * sigma else (found, prior)

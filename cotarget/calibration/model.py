@@ -9,39 +9,14 @@ import numpy.typing as npt
 from annotated_types import Ge
 
 from cotarget.camera import Intrinsics
-from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.rig import Image
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.schema import NotNegative, model
 
 CameraName = Literal["fixed", "zoom"]
+CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 Count = Annotated[int, Ge(0)]
-
-
-@dataclass(frozen=True)
-class Capture:
-    """One image of a calibration board with the state that the devices reported.
-
-    Attributes:
-        image: image, (H, W, 3) BGR.
-        camera: camera that took it.
-        board: number of the board's placement; images with the same number show the board in the same place.
-        pan: reported pan [rad].
-        tilt: reported tilt [rad].
-        focal_px: nominal focal length of the zoom camera [px]; None for the fixed camera.
-        t: middle of the exposure on the rig's clock [s].
-        source: name of the image's file, or None.
-    """
-
-    image: Image
-    camera: CameraName
-    board: int
-    pan: float = 0.0
-    tilt: float = 0.0
-    focal_px: float | None = None
-    t: float = 0.0
-    source: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +58,35 @@ class View:
 def unseen(count: int) -> Array:
     """Make the corners of a view in which none is seen, (count, 2), all nan."""
     return np.full((count, 2), np.nan)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One image of a calibration board with the state that the devices reported.
+
+    Attributes:
+        image: image, (H, W, 3) BGR.
+        camera: camera that took it.
+        board: number of the board's placement; images with the same number show the board in the same place.
+        pan: reported pan [rad].
+        tilt: reported tilt [rad].
+        focal_px: nominal focal length of the zoom camera [px]; None for the fixed camera.
+        t: middle of the exposure on the rig's clock [s].
+        source: name of the image's file, or None.
+    """
+
+    image: Image
+    camera: CameraName
+    board: int
+    pan: float = 0.0
+    tilt: float = 0.0
+    focal_px: float | None = None
+    t: float = 0.0
+    source: str | None = None
+
+    def view(self, corners_px: Array) -> View:
+        """Make the view of the capture from the corners found in it, (N, 2) [px]."""
+        return View(self.camera, corners_px, self.board, self.pan, self.tilt, self.focal_px, self.t, self.source)
 
 
 @model
@@ -209,21 +213,26 @@ class BundleModel:
 
     Attributes:
         boards: T_fixed_board by the number of the placement.
-        fixed: fixed camera; None while only the zoom camera is modelled.
+        fixed: fixed camera.
         zoom_head: zoom camera on its head; None while only the fixed camera is modelled. Its T_head_zoom is the
             identity until it is estimated, and where the head never moves.
         warp: height of the board's middle above its edges, towards its z, by the bend along x and along y [m].
     """
 
     boards: Mapping[int, RigidTransform]
-    fixed: FixedCamera | None = None
+    fixed: FixedCamera
     zoom_head: ZoomHead | None = None
     warp: tuple[float, float] = (0.0, 0.0)
 
+    @property
+    def head(self) -> ZoomHead:
+        """`zoom_head` of a model of both cameras."""
+        assert self.zoom_head is not None
+        return self.zoom_head
+
     def with_zoom_head(self, **changes: Any) -> "BundleModel":
         """Return the model with fields of its `ZoomHead` replaced."""
-        assert self.zoom_head is not None
-        return replace(self, zoom_head=replace(self.zoom_head, **changes))
+        return replace(self, zoom_head=replace(self.head, **changes))
 
     @property
     def stops(self) -> int:
@@ -233,22 +242,17 @@ class BundleModel:
     @property
     def focal_px(self) -> dict[str, float]:
         """Focal length of every lens [px], by the prefix of its parameters' names ("fixed", "zoom[0]")."""
-        found = {} if self.fixed is None else {"fixed": self.fixed.lens.focal_px[0]}
-        stops = () if self.zoom_head is None else self.zoom_head.lens.stops
-        return found | {f"zoom[{i}]": stop.focal_px[0] for i, stop in enumerate(stops)}
+        lenses = {f"zoom[{i}]": stop for i, stop in enumerate(self.head.lens.stops)}
+        return {name: lens.focal_px[0] for name, lens in {"fixed": self.fixed.lens, **lenses}.items()}
+
+    def stop_of(self, view: View) -> int | None:
+        """Find the zoom sample of a view; None for the fixed camera's."""
+        return None if view.camera == "fixed" else stop_of(self.head.lens.nominal_px, view)
 
     def lens_of(self, view: View) -> Intrinsics:
-        """Select the intrinsics with which a view was taken.
-
-        Raises:
-            CalibrationError: there is no model of the view's camera.
-        """
-        if view.camera == "fixed" and self.fixed is not None:
-            return self.fixed.lens
-        if view.camera == "zoom" and self.zoom_head is not None:
-            lens = self.zoom_head.lens
-            return lens.stops[stop_of(lens.nominal_px, view)]
-        raise CalibrationError(f"there are views of the {view.camera} camera, but no model of it")
+        """Select the intrinsics with which a view was taken."""
+        stop = self.stop_of(view)
+        return self.fixed.lens if stop is None else self.head.lens.stops[stop]
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,12 +96,8 @@ class HandMotions:
 def spectrum(normal: Array, noise: Array) -> tuple[Array, Array]:
     """Compute how well each direction of a transform is known, against the limits of use and noise.
 
-    This solves N v = u (L^-2 + k^2 N0) v, with L the limits of use, k `ABOVE_NOISE`, and N0 the normal matrix that
-    noise alone would show.
-
-    Args:
-        normal: normal matrix N of a transform's (w, d), (6, 6) [1/rad^2, 1/m^2].
-        noise: diagonal of N0, (6,).
+    This solves N v = u (L^-2 + k^2 N0) v, with N the normal matrix of a transform's (w, d), L the limits of use, k
+    `ABOVE_NOISE`, and N0 the normal matrix that noise alone would show, given by its diagonal.
 
     Returns:
         Eigenvalues u, ascending, (6,), where u < 1 is undetermined; and the directions v, one per column, (6, 6).
@@ -195,11 +191,7 @@ def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapp
 
 
 def limits_of_use(parameters: Sequence[str], focal_px: Mapping[str, float] = NO_FOCAL_PX) -> Array:
-    """Look up the limit of use of each parameter, in its unit, (n,); see `weak_directions`.
-
-    Raises:
-        CalibrationError: a parameter's name is unknown.
-    """
+    """Look up the limit of use of each parameter, in its unit, (n,); see `weak_directions`."""
     limits = []
     for name in parameters:
         owner, _, kind = name.rpartition(".")
@@ -252,9 +244,7 @@ def _still(basis: Array, rows: Sequence[int]) -> Array:
 def _name_hand(names: Sequence[str], basis: Array) -> tuple[str, list[str], list[str]]:
     """Describe why T_head_zoom is undetermined.
 
-    Args:
-        names: names of its parameters, m of them.
-        basis: rows of the free directions for these, (m, k).
+    The free directions are given by their rows (m, k) for the m parameters with these names.
 
     Returns:
         Reason, names of what is undetermined, and what to add.

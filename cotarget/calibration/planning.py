@@ -50,14 +50,7 @@ class PredictedAccuracy:
     pointing: Array
 
     def error(self, more: Array | float = 0.0) -> float:
-        """Predict the rms pointing error [rad].
-
-        Args:
-            more: normal matrix of further views, (n, n), see `worth`.
-
-        Returns:
-            Error; infinite where a direction is undetermined.
-        """
+        """Predict the rms pointing error [rad] with the normal matrix of further views; infinite if undetermined."""
         total = self.normal + more
         scale = np.sqrt(np.diagonal(total))
         if not (scale > 0).all():
@@ -81,23 +74,19 @@ class PredictedAccuracy:
 
 
 def predict_accuracy(found: Fit, square: float) -> PredictedAccuracy | None:
-    """Predict the accuracy of pointing after a fit at the shortest focal length.
+    """Predict the accuracy of pointing after a fit of both cameras, Gamma and T at the shortest focal length.
 
-    Args:
-        found: fit with Gamma, T and both cameras free.
-        square: side of a square of the board [m], which scales the targets' depths.
-
-    Returns:
-        The prediction; None where there are too few corners, or no target is within reach.
+    The side of the board's squares [m] scales the targets' depths. None where there are too few corners, or no target
+    is within reach.
     """
     model = found.model
-    if found.variance is None or model.fixed is None or model.zoom_head is None:
+    if found.variance is None:
         return None
     size = np.array(model.fixed.size, dtype=float) - 1
     u, v, z = np.meshgrid(*(np.linspace(BORDER, 1 - BORDER, n) for n in ACCURACY_GRID), DEPTHS_SQUARES)
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1) * size
     names = parameter_names(found.free, model.stops)
-    J, _ = miss_derivatives(model, names, pixels, z.ravel() * square, model.zoom_head.lens.nominal_px[0])
+    J, _ = miss_derivatives(model, names, pixels, z.ravel() * square, model.head.lens.nominal_px[0])
     reached = np.isfinite(J).all(axis=(1, 2))
     if not reached.any():
         return None
@@ -179,11 +168,7 @@ def visible(
 ) -> tuple[npt.NDArray[np.bool_], Array]:
     """Check which of many board poses show the whole board, facing the camera and large enough for the finders.
 
-    Args:
-        lens: intrinsics of the camera.
-        x_camera: `board_body` in the camera's frame for each pose [m], (K, 4 + N, 3).
-        board: the board.
-        margin_px: border of the image that the board must keep clear [px].
+    The poses are given as `board_body` in the camera's frame [m], (K, 4 + N, 3).
 
     Returns:
         True for visible boards, (K,), and the inner corners (K, N, 2) [px].
@@ -227,20 +212,12 @@ def plan_placements(
 ) -> list[RigidTransform]:
     """Choose a board placement for each distance: of random candidates, the one that adds most to the coverage.
 
-    Args:
-        model: rough model of the rig; while its ``zoom_head`` is None, only the fixed camera counts.
-        board: the board.
-        coverage: coverage of the images "fixed" and "zoom".
-        shares: distances, as shares of the way from near to far.
-        rng: random numbers.
-        shared: True if the zoom camera must see the board too, at pan = tilt = 0.
-        margin_px: border of the images that the board must keep clear [px].
-        accept: further condition on T_fixed_board.
+    The whole board is in the fixed image, less a margin; if ``shared`` in the zoom image at home too. A model without
+    zoom camera counts the fixed camera alone.
 
     Returns:
-        T_fixed_board, one for each distance at which a candidate is visible.
+        T_fixed_board, one for each distance (a share of the way from near to far) at which a candidate is visible.
     """
-    assert model.fixed is not None
     fixed, head = model.fixed, model.zoom_head
     chosen = []
     for share in shares:
@@ -311,22 +288,10 @@ def plan_poses(
 ) -> list[tuple[float, float]]:
     """Choose head poses that bring a board to parts of the zoom image with few corners so far.
 
-    Args:
-        model: rough model of the rig.
-        T_fixed_board: pose of the board.
-        board: the board.
-        coverage: coverage of the zoom image.
-        limits: limits of the head.
-        count: largest number of poses.
-        rng: random numbers.
-        margin_px: border of the image that the board must keep clear [px].
-
     Returns:
         Up to ``count`` pairs (pan, tilt) [rad], within the limits.
     """
-    head = model.zoom_head
-    assert head is not None
-    lens = head.lens.stops[0]
+    head, lens = model.head, model.head.lens.stops[0]
     middle = (head.T_base_fixed * T_fixed_board).apply(board_points(board).mean(axis=0))
     ray = lens.ray(lens.image_center_px)
     try:
@@ -356,9 +321,8 @@ def plan_poses(
 
 def seen_at_home(model: BundleModel, T_fixed_board: RigidTransform, board: BoardConfig) -> bool:
     """Check whether the zoom camera should see a board at pan = tilt = 0."""
-    assert model.zoom_head is not None
-    x_zoom = (model.zoom_head.T_zoom0_fixed * T_fixed_board).apply(board_body(board))
-    return bool(visible(model.zoom_head.lens.stops[0], x_zoom[None], board, 0.0)[0][0])
+    x_zoom = (model.head.T_zoom0_fixed * T_fixed_board).apply(board_body(board))
+    return bool(visible(model.head.lens.stops[0], x_zoom[None], board, 0.0)[0][0])
 
 
 def random_turns(count: int, rng: np.random.Generator) -> Rotation:

@@ -12,7 +12,7 @@ import numpy as np
 from cotarget.board import board_points
 from cotarget.calibration.bundle import predict_pixels
 from cotarget.calibration.file import Calibration
-from cotarget.calibration.initialization import at_home, place_boards
+from cotarget.calibration.initialization import at_home, by_placement, place_boards
 from cotarget.calibration.model import BundleModel, View
 from cotarget.calibration.uncertainty import model_of
 from cotarget.errors import CalibrationError
@@ -20,13 +20,13 @@ from cotarget.rig import RigSpec
 
 # Largest lengths [m]. Cameras farther apart do not see one board; a lever or a pupil's way this long carries no camera.
 # Given in millimetres, what usual rigs have is beyond all of them: a baseline of 0.4 m, a lever of 30 mm.
-LARGEST_M = {"T_zoom0_fixed": 20.0, "T_head_zoom": 3.0, "head.axis_offset": 1.0, "board.square": 2.0}
-WHAT = {
-    "T_zoom0_fixed": "the cameras are {:.3g} m apart",
-    "T_head_zoom": "the zoom camera is {:.3g} m from the head's axes",
-    "head.axis_offset": "the head's axes are {:.3g} m apart",
-    "board.square": "the board's squares are {:.3g} m large",
+LARGEST_M = {
+    "T_zoom0_fixed": (20.0, "the cameras are {:.3g} m apart"),
+    "T_head_zoom": (3.0, "the zoom camera is {:.3g} m from the head's axes"),
+    "head.axis_offset": (1.0, "the head's axes are {:.3g} m apart"),
+    "board.square": (2.0, "the board's squares are {:.3g} m large"),
 }
+LARGEST_PUPIL_M = 1.0
 # Focal length over the image's width: from 150 degrees of view to a thousandth of a degree.
 FOCAL_WIDTHS = (0.13, 3e4)
 LARGEST_ASPECT = 3.0  # of fx and fy; fields of video have 2
@@ -95,10 +95,11 @@ def _impossible_length(calibration: Calibration) -> str:
     if calibration.board is not None:
         lengths["board.square"] = calibration.board.square
     for where, length in lengths.items():
-        if length > LARGEST_M[where]:
-            return f"{where}: {WHAT[where].format(length)}; lengths are in metres: is {length / 1000:.3g} m meant?"
+        largest, what = LARGEST_M[where]
+        if length > largest:
+            return f"{where}: {what.format(length)}; lengths are in metres: is {length / 1000:.3g} m meant?"
     for i, pupil in enumerate(head.lens.pupil):
-        if abs(pupil) > LARGEST_M["head.axis_offset"]:
+        if abs(pupil) > LARGEST_PUPIL_M:
             return f"zoom.stops[{i}].pupil: the entrance pupil moves by {pupil:.3g} m; lengths are in metres"
     return ""
 
@@ -132,17 +133,12 @@ def _contradiction(calibration: Calibration) -> str:
 
 def _exchanged(model: BundleModel) -> BundleModel:
     """Exchange T and Gamma."""
-    head = model.zoom_head
-    assert head is not None
-    return model.with_zoom_head(T_zoom0_fixed=head.hand_eye(), T_head_zoom=head.T_zoom0_fixed)
+    return model.with_zoom_head(T_zoom0_fixed=model.head.hand_eye(), T_head_zoom=model.head.T_zoom0_fixed)
 
 
 def _checked_views(views: Sequence[View]) -> list[View]:
     """Select the views of a few placements that the fixed camera sees, and the zoom camera with the head turned."""
-    placements: dict[int, list[View]] = defaultdict(list)
-    for view in views:
-        placements[view.board].append(view)
-    shown = [[v for v in same if v.camera == "fixed" or not at_home(v)] for same in placements.values()]
+    shown = [[v for v in same if v.camera == "fixed" or not at_home(v)] for same in by_placement(views).values()]
     both = [same for same in shown if {view.camera for view in same} == {"fixed", "zoom"}]
     return [view for same in both[:: max(len(both) // CHECKED_PLACEMENTS, 1)][:CHECKED_PLACEMENTS] for view in same]
 

@@ -30,7 +30,6 @@ from cotarget.calibration.captures import (
     INDEX,
     NO_IMAGE,
     CaptureIndex,
-    file_name,
     write_command,
     write_image,
     write_index,
@@ -38,12 +37,11 @@ from cotarget.calibration.captures import (
 )
 from cotarget.calibration.corners import find_corners, smallest_spacing
 from cotarget.calibration.handeye import motions, park_martin
-from cotarget.calibration.initialization import board_pose, place_boards, pose_candidates, rough_intrinsics
+from cotarget.calibration.initialization import board_pose, of_both, place_boards, pose_candidates, rough_intrinsics
 from cotarget.calibration.joint import (
     FEWEST_CORNERS,
     FEWEST_STOP_PLACEMENTS,
     SAME_FOCAL,
-    expected_corners,
     expected_inside,
     find_expected,
     fit_stop,
@@ -51,7 +49,7 @@ from cotarget.calibration.joint import (
     spread_stops,
     with_stop,
 )
-from cotarget.calibration.model import BundleModel, Capture, Rejected, View, unseen
+from cotarget.calibration.model import BundleModel, CameraName, Capture, Rejected, View, unseen
 from cotarget.calibration.planning import (
     Coverage,
     PredictedAccuracy,
@@ -66,21 +64,12 @@ from cotarget.calibration.planning import (
     where_in,
 )
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import BoardConfig, RigConfig
+from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, ConfigError, CotargetError, HaltedError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, Rotation, pose_dict
 from cotarget.pantilt import base_head, solve
 from cotarget.parallel import Progress
-from cotarget.rig import (
-    Clock,
-    Frame,
-    Image,
-    PanTiltLimits,
-    PanTiltState,
-    Rig,
-    ZoomCamera,
-    ZoomState,
-)
+from cotarget.rig import Clock, Frame, Image, PanTiltState, Rig, ZoomCamera, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 
 log = logging.getLogger(__name__)
@@ -103,20 +92,6 @@ CornerFinder = Callable[[Image, View], Array | None]
 Seen = TypeVar("Seen")
 
 
-def view_of(capture: Capture, corners_px: Array) -> View:
-    """Make the view of a capture from the corners found in it, (N, 2) [px]."""
-    return View(
-        capture.camera,
-        corners_px,
-        capture.board,
-        capture.pan,
-        capture.tilt,
-        capture.focal_px,
-        capture.t,
-        capture.source,
-    )
-
-
 @dataclass(eq=False)
 class CaptureRecorder:
     """Move head, lens and board, take images, and keep captures and views.
@@ -125,9 +100,6 @@ class CaptureRecorder:
         rig: the rig.
         board: the board in use.
         directory: folder for the captures; None to keep the corners only.
-        pitch_mm: pixel size of the zoom camera [mm], for the index.
-        settle: time after everything stands from which an image counts [s].
-        config: configuration of the rig, stored beside the captures; None if the rig was not made from one.
         views: views found so far.
         rejected: images in which a board was expected but not found.
         number: number of the present placement.
@@ -136,9 +108,6 @@ class CaptureRecorder:
     rig: Rig
     board: BoardConfig
     directory: Path | None = None
-    pitch_mm: float | None = None
-    settle: float = SETTLE
-    config: RigConfig | None = None
     views: list[View] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)
     number: int = -1
@@ -146,12 +115,21 @@ class CaptureRecorder:
     _still_since: float = 0.0
     _wish: tuple[float, float] | None = None
 
-    def start(self) -> None:
-        """Make the folder for captures, send the lens to its shortest focal length and the head home.
+    @property
+    def points(self) -> Array:
+        """The board's corners in its frame [m], (N, 3)."""
+        return board_points(self.board)
 
-        Raises:
-            CalibrationError: the folder cannot be made or holds captures already, or lens or head do not arrive.
-        """
+    def _wait_for(self, t: float) -> None:
+        """Let images count only from a time on [s]."""
+        self._still_since = max(self._still_since, t)
+
+    def _stands_since(self, t: float) -> None:
+        """Let images count from some time after everything stands [s]."""
+        self._wait_for(t + (SETTLE_LONG if self.rig.spec.real_time else SETTLE))
+
+    def start(self) -> None:
+        """Make the folder for captures, send the lens to its shortest focal length and the head home."""
         if self.directory is not None:
             try:
                 self.directory.mkdir(parents=True, exist_ok=True)
@@ -159,21 +137,14 @@ class CaptureRecorder:
                 raise CalibrationError(f"{self.directory}: cannot be made: {error.strerror}") from None
             if (self.directory / INDEX).exists():
                 raise CalibrationError(f"{self.directory}: already holds captures; give another folder")
-            write_session(self.directory, self.config)
+            write_session(self.directory, self.rig.config)
         self.zoom(self.rig.zoom.focal_range[0])
         self.turn(0.0, 0.0)
 
     def zoom(self, nominal_px: float) -> float:
-        """Send the lens to a nominal focal length and wait until it stands.
-
-        Returns:
-            Nominal focal length that the lens reports [px].
-
-        Raises:
-            CalibrationError: the lens goes on moving, or stands elsewhere than commanded.
-        """
-        lens, clock = self.rig.zoom, self.rig.clock
-        begin, wanted = clock.now(), lens.zoom(nominal_px)
+        """Send the lens to a nominal focal length, wait until it stands, and return what it reports [px]."""
+        clock = self.rig.clock
+        begin, wanted = clock.now(), self.rig.zoom.zoom(nominal_px)
         self._note(begin, "zoom", nominal_px, wanted)
         clock.sleep_until(clock.now() + POLL)
         state = wait_for_lens(self.rig)
@@ -181,7 +152,7 @@ class CaptureRecorder:
             raise CalibrationError(
                 f"the zoom lens stands at {state.focal_px:.0f} px where {wanted:.0f} px was commanded"
             )
-        self._still_since = max(self._still_since, state.t + self.settle)
+        self._stands_since(state.t)
         return state.focal_px
 
     def present(self, T_fixed_board: RigidTransform) -> int:
@@ -195,22 +166,18 @@ class CaptureRecorder:
         self.rig.board.present(wish)
         if self.rig.board.patience:
             self._wait_until_held(before)
-        self._still_since = max(self._still_since, self.rig.clock.now() + self.settle)
+        self._stands_since(self.rig.clock.now())
         self.number += 1
         return self.number
 
     def _fixed_corners(self) -> Array | None:
         """Find the board's corners in a frame of the fixed camera exposed after now, (N, 2) [px], or None."""
-        self._still_since = max(self._still_since, self.rig.clock.now())
+        self._wait_for(self.rig.clock.now())
         frame = self._look(self._read_fixed)
         return find_corners(frame.image, self.board, thorough=False)
 
     def _wait_until_held(self, before: Array | None) -> None:
-        """Wait until the board has moved and stands still, at most for `Board.patience`.
-
-        Args:
-            before: corners in the fixed image before the request, (N, 2) [px]; None where the board was not seen.
-        """
+        """Wait until the board has moved from where it was seen ``before`` and is still, at most `Board.patience`."""
         clock = self.rig.clock
         deadline = clock.now() + self.rig.board.patience
         last = None
@@ -247,7 +214,7 @@ class CaptureRecorder:
             way = max(abs(wanted[0] - before.pan), abs(wanted[1] - before.tilt))
             state, arrived = wait_for_head(self.rig, wanted, way)
             if arrived:
-                self._still_since = max(self._still_since, state.t + self.settle)
+                self._stands_since(state.t)
                 return
         raise CalibrationError(
             f"the head stands at pan {np.degrees(state.pan):z.2f}, tilt {np.degrees(state.tilt):z.2f} degrees "
@@ -262,26 +229,16 @@ class CaptureRecorder:
     def see_zoom(self, *, expected: bool = True, find: CornerFinder | None = None) -> View | None:
         """Take an image with the zoom camera at the present head pose and find the board in it.
 
-        Args:
-            expected: True if the board should be in the image: the search is thorough, and an image without it is
-                rejected.
-            find: finder of the corners; None for `find_corners`.
+        Where the board is ``expected``, the search is thorough, and an image without it is rejected.
         """
         frame, pose, lens = self._look(self._read_zoom)
         capture = Capture(frame.image, "zoom", self.number, pose.pan, pose.tilt, lens.focal_px, frame.t)
         return self._keep(capture, expected, find)
 
     def _look(self, look: Callable[[float], Seen]) -> Seen:
-        """Read a frame, and retry where it comes too late.
+        """Read a frame, and retry where it comes too late, up to `TRIES` times in all.
 
         Before each retry the head is sent again to its last goal. It refuses after an emergency stop.
-
-        Args:
-            look: reads a frame exposed after the time that it is given [s].
-
-        Raises:
-            StaleFrameError: the frame came too late each time.
-            EmergencyStopError: the head was stopped meanwhile.
         """
         for _ in range(TRIES - 1):
             try:
@@ -290,7 +247,7 @@ class CaptureRecorder:
                 log.warning("%s; looking again", error)
             if self._wish is not None:
                 self.turn(*self._wish)
-            self._still_since = max(self._still_since, self.rig.clock.now())
+            self._wait_for(self.rig.clock.now())
         return look(self._still_since)
 
     def _read_fixed(self, newer_than: float) -> Frame:
@@ -311,7 +268,7 @@ class CaptureRecorder:
     def save_index(self) -> None:
         """Write index.json with the captures so far."""
         if self.directory is not None and self._captures:
-            write_index(self.directory, CaptureIndex(self.board, self.pitch_mm, tuple(self._captures)))
+            write_index(self.directory, CaptureIndex(self.board, self.rig.spec.zoom.pitch_mm, tuple(self._captures)))
 
     def _note(self, t: float, do: str, asked: object, got: object = None) -> None:
         """Log a command, where captures are kept."""
@@ -323,22 +280,18 @@ class CaptureRecorder:
         if find is None:
             corners = find_corners(capture.image, self.board, thorough=expected)
         else:
-            corners = find(capture.image, view_of(capture, unseen(self.board.corners[0] * self.board.corners[1])))
+            corners = find(capture.image, capture.view(unseen(len(self.points))))
         if corners is None and not expected:
             return None
-        capture = replace(capture, source=file_name(capture, len(self._captures)))
+        name = f"{len(self._captures):04d}_{capture.camera}_board{capture.board:02d}.png"
         if self.directory is not None:
-            assert capture.source is not None
-            write_image(self.directory / capture.source, capture.image)
-        capture = replace(capture, image=NO_IMAGE)
-        self._captures.append(capture)
+            write_image(self.directory / name, capture.image)
+        self._captures.append(replace(capture, image=NO_IMAGE, source=name))
         self.save_index()
         if corners is None:
-            self.rejected.append(Rejected(str(capture.source), "the board was expected but not found"))
+            self.rejected.append(Rejected(name, "the board was expected but not found"))
             return None
-        view = view_of(capture, corners)
-        if self.directory is None:
-            view = replace(view, source=None)
+        view = replace(capture.view(corners), source=None if self.directory is None else name)
         self.views.append(view)
         return view
 
@@ -373,18 +326,14 @@ ENOUGH_VIEWS = 12  # zoom views from which the zoom intrinsics and T's translati
 ROUGH_RMS_PX = 3.0  # a rough fit with a larger rms starts again
 OTHER_LENS = 1.25  # ratio of focal lengths from which the lens and not the head is wrong; a few boards tell a tenth
 CENTRAL = 0.12  # a board is central within this distance of the image's centre, over the image's width
+GAMMA_ALONE: tuple[Block, ...] = ("gamma",)
+ROUGH_BLOCKS: tuple[Block, ...] = ("fixed", "zoom", "gamma", "hand", "head")
 
 
 def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> BundleModel:
-    """Estimate rough intrinsics of the fixed camera, from one board straight ahead and a few tilted ones.
-
-    Raises:
-        CalibrationError: the fixed camera does not see the board.
-    """
-    board, points = recorder.board, board_points(recorder.board)
-    width, height = size = recorder.rig.fixed.size
-    supposed = width / 2 / np.tan(FIRST_FIELD / 2)
-    lens = Intrinsics(size, (supposed, supposed), ((width - 1) / 2, (height - 1) / 2))
+    """Estimate rough intrinsics of the fixed camera, from one board straight ahead and a few tilted ones."""
+    board, size = recorder.board, recorder.rig.fixed.size
+    lens = _pinhole(size, size[0] / 2 / np.tan(FIRST_FIELD / 2))
     tried = []
     for share in FIRST_SHARES:
         depth = distance(board, lens, share)
@@ -403,25 +352,33 @@ def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> BundleMo
     recorder.see_zoom(expected=False)
     coverage = {"fixed": Coverage(size)}
     for k in range(LEARNING):
-        model = BundleModel(boards={}, fixed=FixedCamera(lens))
-        shares = [preferred_share(k)]
-        wishes = plan_placements(model, board, coverage, shares, rng, shared=False, margin_px=ROUGH_MARGIN * width)
+        model, shares, margin_px = BundleModel({}, FixedCamera(lens)), [preferred_share(k)], ROUGH_MARGIN * size[0]
+        wishes = plan_placements(model, board, coverage, shares, rng, shared=False, margin_px=margin_px)
         if not wishes:
             continue
         recorder.present(wishes[0])
         if (view := recorder.see_fixed()) is not None:
             coverage["fixed"].add(view.corners_px[view.seen])
         recorder.see_zoom(expected=False)
-    views = [view for view in recorder.views if view.camera == "fixed"]
-    return BundleModel(boards={}, fixed=FixedCamera(rough_intrinsics("fixed", views, points, size)))
+    return BundleModel({}, FixedCamera(_rough_lens(recorder, "fixed")))
+
+
+def _pinhole(size: tuple[int, int], focal_px: float) -> Intrinsics:
+    """Make intrinsics without distortion, with the principal point in the middle of the image."""
+    return Intrinsics(size, (focal_px, focal_px), ((size[0] - 1) / 2, (size[1] - 1) / 2))
+
+
+def _rough_lens(recorder: CaptureRecorder, camera: CameraName) -> Intrinsics:
+    """Estimate rough intrinsics of a camera from all its views so far."""
+    views = [view for view in recorder.views if view.camera == camera]
+    size = (recorder.rig.fixed if camera == "fixed" else recorder.rig.zoom).size
+    return rough_intrinsics(camera, views, recorder.points, size)
 
 
 def learn_zoom(recorder: CaptureRecorder, model: BundleModel) -> BundleModel:
     """Estimate rough Gamma and T: find the board in the zoom image, and turn the head a little."""
-    assert model.fixed is not None
     focal = recorder.rig.zoom.state().focal_px
-    width, height = size = recorder.rig.zoom.size
-    zoom = Intrinsics(size, (focal, focal), ((width - 1) / 2, (height - 1) / 2))
+    zoom = _pinhole(recorder.rig.zoom.size, focal)
     view = _find_with_zoom(recorder, model)
     by_pan, by_tilt = _turn_a_little(recorder, view)
     centred = _centred(recorder, view, by_pan, by_tilt)
@@ -436,14 +393,17 @@ def learn_zoom(recorder: CaptureRecorder, model: BundleModel) -> BundleModel:
 
 def _present_otherwise_tilted(recorder: CaptureRecorder, model: BundleModel, view: View) -> None:
     """Present the board in the same place with another tilt; only the true one of Gamma's mirror images fits both."""
-    assert model.fixed is not None
-    points = board_points(recorder.board)
-    fixed_view = next(v for v in recorder.of_placement(view.board) if v.camera == "fixed")
-    middle = board_pose(model.fixed.lens, fixed_view.corners_px, points).apply(points.mean(axis=0))
+    middle = _pose_of(recorder, model, view.board).apply(recorder.points.mean(axis=0))
     recorder.turn(view.pan, view.tilt)
     recorder.present(facing_board(recorder.board, middle, CLEARLY_TILTED.inv()))
     recorder.see_fixed()
     recorder.see_zoom(expected=False)
+
+
+def _pose_of(recorder: CaptureRecorder, model: BundleModel, number: int) -> RigidTransform:
+    """Estimate T_fixed_board of a placement from the fixed camera's view."""
+    view = next(v for v in recorder.of_placement(number) if v.camera == "fixed")
+    return board_pose(model.fixed.lens, view.corners_px, recorder.points)
 
 
 def _likeliest(model: BundleModel, recorder: CaptureRecorder, seen: Sequence[View]) -> BundleModel:
@@ -452,16 +412,10 @@ def _likeliest(model: BundleModel, recorder: CaptureRecorder, seen: Sequence[Vie
     Each view has two possible poses of the board. Every combination makes a model, and the one that fits all views so
     far best is chosen.
     """
-    assert model.fixed is not None
-    assert model.zoom_head is not None
-    points, zoom = board_points(recorder.board), model.zoom_head.lens.stops[0]
+    points, zoom = recorder.points, model.head.lens.stops[0]
     heads = [base_head(view.pan, view.tilt) for view in seen]
-    fixed_view = next(v for v in recorder.of_placement(seen[0].board) if v.camera == "fixed")
-    T_fixed_board = board_pose(model.fixed.lens, fixed_view.corners_px, points)
-    both = {v.board for v in recorder.views if v.camera == "fixed"} & {
-        v.board for v in recorder.views if v.camera == "zoom"
-    }
-    views = [view for view in recorder.views if view.board in both]
+    T_fixed_board = _pose_of(recorder, model, seen[0].board)
+    views = of_both(recorder.views)
     results: list[tuple[float, BundleModel]] = []
     refused = None
     for boards in itertools.product(*(pose_candidates(zoom, view.corners_px, points) for view in seen)):
@@ -486,12 +440,8 @@ def _check_lens(told_px: float, recorder: CaptureRecorder) -> None:
     """Refuse a zoom lens whose focal length is far from what the boards in its images show.
 
     Through a wrong focal length the camera seems to turn by another angle than the head.
-
-    Raises:
-        CalibrationError: the lens reports another focal length than it has.
     """
-    views = [view for view in recorder.views if view.camera == "zoom"]
-    seen_px = rough_intrinsics("zoom", views, board_points(recorder.board), recorder.rig.zoom.size).focal_px[0]
+    seen_px = _rough_lens(recorder, "zoom").focal_px[0]
     if max(seen_px / told_px, told_px / seen_px) > OTHER_LENS:
         raise CalibrationError(
             f"the zoom lens reports a focal length of {told_px:.0f} px, and the boards in its pictures look as through "
@@ -500,12 +450,7 @@ def _check_lens(told_px: float, recorder: CaptureRecorder) -> None:
 
 
 def _find_with_zoom(recorder: CaptureRecorder, model: BundleModel) -> View:
-    """Scan with the head until the zoom camera sees a placement that the fixed camera sees too.
-
-    Raises:
-        CalibrationError: the zoom camera sees the board nowhere.
-    """
-    assert model.fixed is not None
+    """Scan with the head until the zoom camera sees a placement that the fixed camera sees too."""
     limits = recorder.rig.head.limits
     steps = [
         np.arange(-round(reach / SCAN_STEP), round(reach / SCAN_STEP) + 1) * SCAN_STEP
@@ -535,11 +480,7 @@ def _find_with_zoom(recorder: CaptureRecorder, model: BundleModel) -> View:
 
 
 def _turn_a_little(recorder: CaptureRecorder, view: View) -> tuple[View, View]:
-    """Take a zoom view of the same board at another pan, and one at another tilt.
-
-    Raises:
-        CalibrationError: the zoom camera loses the board.
-    """
+    """Take a zoom view of the same board at another pan, and one at another tilt."""
     limits = recorder.rig.head.limits
     seen: list[View] = []
     for name, d_pan, d_tilt in (("pan", SMALL_TURN, 0.0), ("tilt", 0.0, SMALL_TURN)):
@@ -578,32 +519,23 @@ def _centred(recorder: CaptureRecorder, view: View, by_pan: View, by_tilt: View)
     J = np.stack([(at_pan - middle) / (by_pan.pan - view.pan), (at_tilt - middle) / (by_tilt.tilt - view.tilt)], axis=1)
     d_pan, d_tilt = np.linalg.lstsq(J, off, rcond=None)[0]
     limits = recorder.rig.head.limits
-    recorder.turn(
-        float(np.clip(view.pan + d_pan, *limits.pan)),
-        float(np.clip(view.tilt + d_tilt, *limits.tilt)),
-    )
+    recorder.turn(float(np.clip(view.pan + d_pan, *limits.pan)), float(np.clip(view.tilt + d_tilt, *limits.tilt)))
     return recorder.see_zoom(expected=False) or view
 
 
 def refitted(model: BundleModel, recorder: CaptureRecorder) -> Fit:
     """Fit the rough model to all views so far: Gamma alone at first, everything with `ENOUGH_VIEWS` zoom views."""
-    points: Array = board_points(recorder.board)
-    views = recorder.views
+    points, views = recorder.points, recorder.views
     if sum(view.camera == "zoom" for view in views) < ENOUGH_VIEWS:
-        only_gamma: tuple[Block, ...] = ("gamma",)
-        return fit(place_boards(model, views, points), views, points, only_gamma)
-    blocks: tuple[Block, ...] = ("fixed", "zoom", "gamma", "hand", "head")
-    result = fit(place_boards(model, views, points), views, points, blocks)
+        return fit(place_boards(model, views, points), views, points, GAMMA_ALONE)
+    result = fit(place_boards(model, views, points), views, points, ROUGH_BLOCKS)
     if result.rms_px <= ROUGH_RMS_PX:
         return result
     # The intrinsics from the first views are too far off: start again with intrinsics from all views.
-    by_camera = {name: [view for view in views if view.camera == name] for name in ("fixed", "zoom")}
-    fixed = rough_intrinsics("fixed", by_camera["fixed"], points, recorder.rig.fixed.size)
-    zoom = rough_intrinsics("zoom", by_camera["zoom"], points, recorder.rig.zoom.size)
-    assert model.zoom_head is not None
-    lens = ZoomLens(model.zoom_head.lens.nominal_px, (zoom,))
-    afresh = place_boards(replace(model, fixed=FixedCamera(fixed)).with_zoom_head(lens=lens), views, points)
-    again = fit(fit(afresh, views, points, {"gamma"}).model, views, points, blocks)
+    lens = ZoomLens(model.head.lens.nominal_px, (_rough_lens(recorder, "zoom"),))
+    fixed = FixedCamera(_rough_lens(recorder, "fixed"))
+    afresh = place_boards(replace(model, fixed=fixed).with_zoom_head(lens=lens), views, points)
+    again = fit(fit(afresh, views, points, GAMMA_ALONE).model, views, points, ROUGH_BLOCKS)
     return min((result, again), key=lambda one: one.rms_px)
 
 
@@ -616,11 +548,7 @@ LENS_TIMEOUT = 15.0  # the slowest zoom lenses take some ten seconds from end to
 
 
 def wait_for_lens(rig: Rig) -> ZoomState:
-    """Wait until the zoom lens stands, and return its state.
-
-    Raises:
-        CalibrationError: the lens still moves after `LENS_TIMEOUT`.
-    """
+    """Wait until the zoom lens stands, and return its state."""
     clock = rig.clock
     deadline = clock.now() + LENS_TIMEOUT
     while (state := rig.zoom.state()).moving:
@@ -631,12 +559,7 @@ def wait_for_lens(rig: Rig) -> ZoomState:
 
 
 def wait_for_head(rig: Rig, wanted: tuple[float, float], way: float) -> tuple[PanTiltState, bool]:
-    """Wait until the head stands where it was commanded, or the timeout is over.
-
-    Args:
-        rig: rig with the head.
-        wanted: commanded pan and tilt [rad].
-        way: travel from where the head was, the larger of both axes' [rad].
+    """Wait until the head stands where it was commanded [rad], or the timeout for its way there [rad] is over.
 
     Returns:
         State of the head, and True if it has arrived.
@@ -673,28 +596,12 @@ def see_stops(
     rng: np.random.Generator,
     tell: Callable[[str], None],
 ) -> BundleModel:
-    """Take views at all zoom samples but the first, and add the samples to the model.
-
-    Args:
-        recorder: recorder that holds the views at the shortest focal length.
-        model: model fitted to these views.
-        stops: nominal focal lengths of the zoom samples [px], increasing, the shortest first.
-        placements: number of placements of the board.
-        rng: random numbers.
-        tell: called with a text about the progress.
-
-    Returns:
-        The model with the zoom samples that were seen.
-    """
-    assert model.fixed is not None
-    assert model.zoom_head is not None
-    points = board_points(recorder.board)
-    size = recorder.rig.zoom.size
+    """Take views at all zoom samples but the first, and return the model with those that were seen."""
     coverage = {"fixed": Coverage(recorder.rig.fixed.size)}
     for view in recorder.views:
         if view.camera == "fixed":
             coverage["fixed"].add(view.corners_px[view.seen])
-    reachable = functools.partial(_reachable, model, recorder.rig.head.limits, points)
+    reachable = functools.partial(_reachable, recorder, model)
     at_stop: dict[int, Coverage] = {}
     only_fixed = replace(model, zoom_head=None)
     done = 0
@@ -720,8 +627,8 @@ def see_stops(
             number, guessed = _stop_at(model, nominal)
             if not number:  # a lens with few positions goes to the first one again
                 continue
-            cover = at_stop.setdefault(number, Coverage(size))
-            learnt = _see_stop(recorder, guessed, number, fixed_view, cover, rng, points)
+            cover = at_stop.setdefault(number, Coverage(recorder.rig.zoom.size))
+            learnt = _see_stop(recorder, guessed, number, fixed_view, cover, rng)
             if learnt is None:
                 break  # a sample that was not seen cannot predict the next one
             model = learnt
@@ -729,14 +636,12 @@ def see_stops(
     return model
 
 
-def _reachable(model: BundleModel, limits: PanTiltLimits, points: Array, wish: RigidTransform) -> bool:
+def _reachable(recorder: CaptureRecorder, model: BundleModel, wish: RigidTransform) -> bool:
     """Check whether the head can point at every corner of a board at a pose T_fixed_board."""
-    head = model.zoom_head
-    assert head is not None
-    lens = head.lens.stops[0]
-    corners = (head.T_base_fixed * wish).apply(points)
+    head, lens = model.head, model.head.lens.stops[0]
+    corners = (head.T_base_fixed * wish).apply(recorder.points)
     found = solve(corners, head.hand_eye(), head.axes, lens.ray(lens.image_center_px))
-    return bool(limits.allow(found.pan[:, 0], found.tilt[:, 0]).all())
+    return bool(recorder.rig.head.limits.allow(found.pan[:, 0], found.tilt[:, 0]).all())
 
 
 def _stop_at(model: BundleModel, nominal: float) -> tuple[int, BundleModel]:
@@ -745,8 +650,7 @@ def _stop_at(model: BundleModel, nominal: float) -> tuple[int, BundleModel]:
     Returns:
         Number of the zoom sample, and the model that contains it.
     """
-    assert model.zoom_head is not None
-    lens = model.zoom_head.lens
+    lens = model.head.lens
     away = np.abs(np.log(np.array(lens.nominal_px) / nominal))
     if nominal <= lens.nominal_px[-1] or away.min() <= SAME_FOCAL:
         return int(np.argmin(away)), model
@@ -760,20 +664,18 @@ def _see_stop(
     fixed_view: View,
     coverage: Coverage,
     rng: np.random.Generator,
-    points: Array,
 ) -> BundleModel | None:
     """Take views of the present placement at a zoom sample; fit the sample when it is first seen.
 
     Returns:
         The model with the zoom sample; None where a sample not yet fitted was not seen.
     """
-    assert model.zoom_head is not None
-    nominal = model.zoom_head.lens.nominal_px[number]
+    points, nominal = recorder.points, model.head.lens.nominal_px[number]
     known = any(view.camera == "zoom" and same_focal(view, nominal) for view in recorder.views)
     placed = place_boards(model, [fixed_view], points)
     here: list[View] = []
     for _ in range(VIEWS_A_STOP if known else FIRST_VIEWS):
-        seen = _see_part(recorder, placed, nominal, coverage, rng, points)
+        seen = _see_part(recorder, placed, nominal, coverage, rng)
         if seen is not None and not known:
             here.append(seen)
             placed = fit_stop(placed, number, [fixed_view, *here], points)
@@ -781,72 +683,43 @@ def _see_stop(
 
 
 def _see_part(
-    recorder: CaptureRecorder,
-    model: BundleModel,
-    nominal: float,
-    coverage: Coverage,
-    rng: np.random.Generator,
-    points: Array,
+    recorder: CaptureRecorder, model: BundleModel, nominal: float, coverage: Coverage, rng: np.random.Generator
 ) -> View | None:
     """Turn the head so that a part of the board covers new parts of the zoom image, and take a view."""
-    turn = plan_part(model, recorder.number, nominal, coverage, recorder.rig.head.limits, rng, points)
+    turn = plan_part(recorder, model, nominal, coverage, rng)
     if turn is None:
         return None
     recorder.turn(*turn)
-    view = recorder.see_zoom(
-        find=lambda image, view: find_expected(image, recorder.board, expected_corners(model, view, points))
-    )
+    view = recorder.see_zoom(find=lambda image, view: find_expected(image, view, model, recorder.board))
     if view is not None:
         coverage.add(view.corners_px[view.seen])
     return view
 
 
 def plan_part(
-    model: BundleModel,
-    board: int,
-    nominal: float,
-    coverage: Coverage,
-    limits: PanTiltLimits,
-    rng: np.random.Generator,
-    points: Array,
+    recorder: CaptureRecorder, model: BundleModel, nominal: float, coverage: Coverage, rng: np.random.Generator
 ) -> tuple[float, float] | None:
     """Choose the head pose that adds most to the coverage, of random poses that bring a corner to a pixel.
 
-    Args:
-        model: model with the board and the zoom sample.
-        board: number of the placement.
-        nominal: nominal focal length [px].
-        coverage: coverage of the zoom image at this focal length.
-        limits: limits of the head.
-        rng: random numbers.
-        points: the board's corners in its frame [m], (N, 3).
-
     Returns:
-        Pan and tilt [rad]; None where no pose within the limits shows enough of the board.
+        Pan and tilt [rad]; None where no pose within the limits shows enough of the present placement.
     """
-    head = model.zoom_head
-    assert head is not None
+    head, points = model.head, recorder.points
     lens, hand = head.lens.at(nominal), head.hand_eye(nominal)
-    T_base_board = head.T_base_fixed * model.boards[board]
+    T_base_board = head.T_base_fixed * model.boards[recorder.number]
     chosen = points[rng.integers(len(points), size=CANDIDATES)]
     pixels = rng.uniform(BORDER_PX, np.array(lens.size) - 1 - BORDER_PX, size=(CANDIDATES, 2))
     found = solve(T_base_board.apply(chosen), hand, head.axes, lens.ray(pixels))
     pan, tilt = found.pan[:, 0], found.tilt[:, 0]
-    allowed = limits.allow(pan, tilt)
     best, most = None, 0.0
     R, t, _ = base_heads(head.axes, np.nan_to_num(pan), np.nan_to_num(tilt))
     x_zoom = hand.inv().apply(((T_base_board.apply(points) - t[:, None]) @ R).reshape(-1, 3)).reshape(CANDIDATES, -1, 3)
-    for k in np.flatnonzero(allowed):
-        seen = _seen(lens, x_zoom[k])
+    for k in np.flatnonzero(recorder.rig.head.limits.allow(pan, tilt)):
+        seen = lens.project(x_zoom[k])
+        seen = seen[expected_inside(seen, lens.size)]
         if len(seen) >= FEWEST_CORNERS and (gain := coverage.gain(seen)) > most:
             best, most = k, gain
     return None if best is None else (float(pan[best]), float(tilt[best]))
-
-
-def _seen(lens: Intrinsics, x_zoom: Array) -> Array:
-    """Project points (N, 3) and select the pixels inside the image, (n, 2)."""
-    pixels = lens.project(x_zoom)
-    return pixels[expected_inside(pixels, lens.size)]
 
 
 # Full stills, for a zoom camera whose stream is only a small preview
@@ -934,15 +807,7 @@ def capture_session(
     stops: int = 1,
     far_placements: int = 0,
 ) -> None:
-    """Run a capture session: fill a recorder with views that calibrate its rig.
-
-    Args:
-        recorder: recorder of a rig that stands still.
-        placements: number of placements of the board at the shortest focal length, with those for the rough model.
-        stops: number of zoom samples.
-        far_placements: number of further placements for the zoom samples beyond the first.
-        rng: random numbers, which choose among possible placements.
-        progress: called with the number done, the total, and a text.
+    """Run a capture session: fill a recorder with views that calibrate its rig; see `calibrate` for the arguments.
 
     Raises:
         CalibrationError: a camera never sees the board, or the head or the lens fails.
@@ -1017,8 +882,7 @@ def _cover(
     tell: Callable[[str], None],
 ) -> BundleModel:
     """Take views of placements that cover both images, from several head poses each, and refine the rough model."""
-    rig, points = recorder.rig, board_points(recorder.board)
-    coverage = {"fixed": Coverage(rig.fixed.size), "zoom": Coverage(rig.zoom.size)}
+    coverage = {"fixed": Coverage(recorder.rig.fixed.size), "zoom": Coverage(recorder.rig.zoom.size)}
     for view in recorder.views:
         coverage[view.camera].add(view.corners_px[view.seen])
     predicted: PredictedAccuracy | None = None
@@ -1037,7 +901,6 @@ def _cover(
         if misses > MOST_MISSES:
             raise CalibrationError(f"the fixed camera lost the board: not seen {misses} times in a row")
         if fixed_view is None:
-            assert model.fixed is not None
             coverage["fixed"].misses.append(where_in(model.fixed.lens, recorder.board, wish))
             continue
         T = _see_from_everywhere(recorder, model, wish, fixed_view, coverage, margin, rng)
@@ -1048,7 +911,7 @@ def _cover(
             predicted = predict_accuracy(found, recorder.board.square) if "hand" in found.free else None
         elif predicted is not None:
             seen = recorder.of_placement(recorder.number)
-            predicted = predicted.with_views(seen, {recorder.number: T}, points)
+            predicted = predicted.with_views(seen, {recorder.number: T}, recorder.points)
     return refitted(model, recorder).model
 
 
@@ -1064,18 +927,15 @@ def _next_placement(
 
     Before the accuracy can be predicted, it is the one that most head poses show.
     """
-    assert model.fixed is not None
-    assert model.zoom_head is not None
-    board, limits, points = recorder.board, recorder.rig.head.limits, board_points(recorder.board)
+    board, limits, points = recorder.board, recorder.rig.head.limits, recorder.points
     margin_px = margin * model.fixed.size[0]
     shares = [preferred_share(recorder.number), *rng.uniform(size=CHOICES - 1)]
     wishes = plan_placements(model, board, coverage, shares[: CHOICES // 2], rng, shared=True, margin_px=margin_px)
     wishes += plan_placements(model, board, coverage, shares[len(wishes) :], rng, shared=False, margin_px=margin_px)
     best, least = None, (np.inf, np.inf)
     for wish in wishes:
-        turns = plan_poses(
-            model, wish, board, coverage["zoom"], limits, MOVED_VIEWS, rng, margin * model.zoom_head.lens.size[0]
-        )
+        zoom_margin_px = margin * model.head.lens.size[0]
+        turns = plan_poses(model, wish, board, coverage["zoom"], limits, MOVED_VIEWS, rng, zoom_margin_px)
         if seen_at_home(model, wish, board):
             turns = [(0.0, 0.0), *turns]
         error = np.inf
@@ -1102,10 +962,9 @@ def _see_from_everywhere(
 
     The pose comes from the fixed camera's view.
     """
-    assert model.fixed is not None
     rig, board = recorder.rig, recorder.board
     # Of the view's two possible poses, the one nearer to the requested rotation.
-    poses = pose_candidates(model.fixed.lens, fixed_view.corners_px, board_points(board))
+    poses = pose_candidates(model.fixed.lens, fixed_view.corners_px, recorder.points)
     T = min(poses, key=lambda pose: float((pose.rotation * wish.rotation.inv()).magnitude()))
     home = seen_at_home(model, T, board)
     turns = plan_poses(

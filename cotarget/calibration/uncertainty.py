@@ -17,7 +17,6 @@ from dataclasses import replace
 import numpy as np
 
 from cotarget.calibration.bundle import (
-    EVERY_BLOCK,
     POSE_PARAMETERS,
     Batch,
     Block,
@@ -28,15 +27,16 @@ from cotarget.calibration.bundle import (
     batches_of,
     fit,
     masked,
+    nudged,
     parameter_names,
     predict,
     reduced,
     rms,
     robust_scale,
-    stepped,
 )
 from cotarget.calibration.file import Calibration
-from cotarget.calibration.model import BundleModel, Covariance, HeldOut, View, stop_of
+from cotarget.calibration.initialization import of_both
+from cotarget.calibration.model import BundleModel, Covariance, HeldOut, View
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import solve
@@ -60,7 +60,7 @@ def with_consider_covariance(
     Args:
         covariance: covariance of the fit.
         found: the fit.
-        points: the board's corners in its frame [m], (N, 3).
+        points: the board's corners.
         held: blocks that were held in the fit.
         prior: prior of the fit and of the held blocks.
 
@@ -103,33 +103,24 @@ FEWEST_VIEWS = 3  # views of a zoom sample that must remain for a fold's views a
 def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -> HeldOut | None:
     """Predict every placement by a fit of the others (held-out check).
 
-    Args:
-        found: fit of all views, from which the others start.
-        points: the board's corners in its frame [m], (N, 3).
-        prior: prior of the fit.
-        folds: number of parts into which the placements are split.
-
-    Returns:
-        Result of the check; None where both cameras see fewer placements than folds, or where the remaining placements
-        do not determine the rig.
+    The placements are split into ``folds`` parts. None where both cameras see fewer placements, or where the remaining
+    placements do not determine the rig.
     """
-    both = {v.board for v in found.views if v.camera == "fixed"} & {v.board for v in found.views if v.camera == "zoom"}
-    numbers = sorted(both)
+    numbers = sorted({view.board for view in of_both(found.views)})
     if len(numbers) < folds:
         return None
     misses: list[Array] = []
     expected: list[Array] = []
     left: list[Array] = []
+    stop_of = found.model.stop_of
     for k in range(folds):
         out = set(numbers[k::folds])
         rest = [view for view in found.views if view.board not in out]
-        assert found.model.zoom_head is not None
-        stops = found.model.zoom_head.lens.nominal_px
-        remaining = Counter(stop_of(stops, view) for view in rest if view.camera == "zoom")
+        remaining = Counter(stop_of(view) for view in rest)
         kept = [
             view
             for view in found.views
-            if view.board in out and (view.camera == "fixed" or remaining[stop_of(stops, view)] >= FEWEST_VIEWS)
+            if view.board in out and (view.camera == "fixed" or remaining[stop_of(view)] >= FEWEST_VIEWS)
         ]
         try:
             partial = fit(found.model, rest, points, found.free, prior=prior, jitter=found.jitter)
@@ -169,7 +160,6 @@ def _predicted(found: Fit, covariance: Array, kept: Sequence[View], points: Arra
     """
     model, variance = found.model, found.variance
     assert variance is not None
-    assert model.zoom_head is not None
     fixed = [view for view in kept if view.camera == "fixed"]
     zoom = [view for view in kept if view.camera == "zoom"]
     told = fit(model, fixed, points, ()).model
@@ -197,7 +187,7 @@ def _predicted(found: Fit, covariance: Array, kept: Sequence[View], points: Arra
         if found.jitter and p.by_turn is not None:
             Q = _mean(p.by_turn, batch)
             cov = cov + found.jitter**2 * Q @ Q.swapaxes(1, 2)
-        nominal = model.zoom_head.lens.nominal_px
+        nominal = model.head.lens.nominal_px
         scale = nominal[0] / nominal[batch.stop or 0]
         misses[batch.rows] = _mean(p.pixels - batch.observed, batch) * scale
         covariances[batch.rows] = cov * scale**2
@@ -217,18 +207,13 @@ def _mean(values: Array, batch: Batch) -> Array:
 STEP = 1e-5
 # Smaller eigenvalues of the normal matrix, scaled to a unit diagonal, may be rounding.
 SMALLEST_EIGENVALUE = 1e-13
-LENS_BLOCKS = ("zoom", "pupil")  # blocks that change the zoom camera's line of sight but not the targets
 
 
 def covariance_of(result: Fit) -> Covariance | None:
     """Compute the covariance of a fit's free parameters, with the boards' poses marginalised.
 
-    Args:
-        result: result of `fit`.
-
-    Returns:
-        Inverse of the normal matrix times the variance of a coordinate; None where the views leave a direction
-        undetermined, or hold no more coordinates than parameters.
+    It is the inverse of the normal matrix times the variance of a coordinate; None where the views leave a direction
+    undetermined, or hold no more coordinates than parameters.
     """
     scale = np.sqrt(np.diagonal(result.normal))
     if result.variance is None or not (scale > 0).all():
@@ -283,7 +268,7 @@ def line_of_sight_covariance(
         Covariance along right and down in the zoom image [rad^2], (..., 2, 2); nan where the target cannot be reached.
 
     Raises:
-        CalibrationError: the calibration has no covariance, or an unusable one, or no T.
+        CalibrationError: the calibration has no covariance or no T.
     """
     calibration.zoom_head.hand_eye()  # raises without T
     lens = calibration.zoom_head.lens
@@ -291,9 +276,6 @@ def line_of_sight_covariance(
     if covariance is None:
         raise CalibrationError("this calibration has no covariance; calibrate again, by the joint method")
     model = model_of(calibration)
-    known = parameter_names(EVERY_BLOCK, model.stops)
-    if unknown := [name for name in covariance.parameters if name not in known]:
-        raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")
     nominal = np.asarray(lens.nominal_px[0] if nominal_px is None else nominal_px, dtype=float)
     depth = np.asarray(depth, dtype=float)
     shape = np.broadcast_shapes(np.shape(pixel)[:-1], depth.shape, nominal.shape)
@@ -320,41 +302,27 @@ def miss_derivatives(
 ) -> tuple[Array, Array]:
     """Compute the derivatives of the miss m of `line_of_sight_covariance`, by central differences.
 
-    Args:
-        model: model of the rig.
-        parameters: names of the k parameters.
-        pixels: pixels of the targets in the fixed image, (n, 2).
-        depths: depths of the targets along the fixed camera's axis [m], (n,).
-        nominal_px: nominal focal length of the zoom camera [px], (n,), or one for all.
-        pan_tilt: pan and tilt of the head [rad], (n,) each; None for the exact solution that faces forward.
+    There are n targets, at pixels (n, 2) and depths (n,) [m]. See there for the other arguments.
 
     Returns:
-        Derivatives by the parameters, (n, 2, k), and by pan and tilt, (n, 2, 2); nan for targets out of reach.
+        Derivatives by the k parameters, (n, 2, k), and by pan and tilt, (n, 2, 2); nan for targets out of reach.
     """
-    assert model.fixed is not None
     nominals = np.broadcast_to(nominal_px, depths.shape)
     x_fixed = model.fixed.ray(pixels) * depths[:, None]
     if pan_tilt is None:
         pan_tilt = _pointed(model, x_fixed, nominals)
     pan, tilt = pan_tilt
     across = _at_each(nominals, lambda f: _across(_line_of_sight(model, f)))
-    model = replace(model, boards={})
     x_zoom = _moved_targets(model, x_fixed, pan, tilt)
 
     def miss(at: BundleModel, x_zoom: Array) -> Array:
         off = _directions(at, x_zoom, nominals) - _at_each(nominals, lambda f: _line_of_sight(at, f))
         return np.einsum("ni,nij->nj", off, across)
 
-    names = {block: parameter_names((block,), model.stops) for block in EVERY_BLOCK}
-    block_of = {name: block for block, own in names.items() for name in own}
-
     def beside(name: str, step: float) -> Array:
-        block = block_of[name]
-        steps = step * np.array([name == other for other in names[block]], dtype=float)
-        at = stepped(model, steps, np.empty((0, POSE_PARAMETERS)), (block,))
-        if block in LENS_BLOCKS:
+        at = nudged(model, name, step)
+        if name.startswith("zoom["):  # it changes the line of sight but not the targets
             return miss(at, x_zoom)
-        assert at.fixed is not None
         moved = x_fixed if at.fixed is model.fixed else at.fixed.ray(pixels) * depths[:, None]
         return miss(at, _moved_targets(at, moved, pan, tilt))
 
@@ -378,8 +346,7 @@ def _at_each(nominals: Array, compute: Callable[[float], Array]) -> Array:
 
 def _pointed(model: BundleModel, x_fixed: Array, nominals: Array) -> tuple[Array, Array]:
     """Solve pan and tilt that show targets in the middle of the zoom image, facing forward, (n,) each [rad]."""
-    assert model.zoom_head is not None
-    head = model.zoom_head
+    head = model.head
     x_base = head.T_base_fixed.apply(x_fixed)
     angles = np.empty((2, len(nominals)))
     for nominal in np.unique(nominals):
@@ -399,8 +366,7 @@ def model_of(calibration: Calibration) -> BundleModel:
 
 def _moved_targets(model: BundleModel, x_fixed: Array, pan: Array, tilt: Array) -> Array:
     """Compute the targets in the moved zoom camera's frame at the first zoom sample [m], (n, 3) (Eq. 2)."""
-    head = model.zoom_head
-    assert head is not None
+    head = model.head
     x_base = head.T_base_fixed.apply(x_fixed)
     R, t, _ = base_heads(head.axes, pan, tilt)
     return head.hand_eye().inv().apply(np.einsum("vji,vj->vi", R, x_base - t))
@@ -408,15 +374,13 @@ def _moved_targets(model: BundleModel, x_fixed: Array, pan: Array, tilt: Array) 
 
 def _directions(model: BundleModel, x_zoom: Array, nominals: Array) -> Array:
     """Compute unit vectors from the pupil at nominal focal lengths (n,) to the targets of `_moved_targets`, (n, 3)."""
-    assert model.zoom_head is not None
-    zoom = model.zoom_head.lens
+    zoom = model.head.lens
     return _unit(x_zoom - _at_each(nominals, lambda f: np.array([0.0, 0.0, zoom.pupil_at(f)])))
 
 
 def _line_of_sight(model: BundleModel, nominal_px: float) -> Array:
     """Compute the unit vector through the middle of the zoom image at a nominal focal length, (3,)."""
-    assert model.zoom_head is not None
-    lens = model.zoom_head.lens.at(nominal_px)
+    lens = model.head.lens.at(nominal_px)
     return _unit(lens.ray(lens.image_center_px))
 
 

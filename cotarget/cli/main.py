@@ -294,6 +294,7 @@ def make_parser() -> argparse.ArgumentParser:
     file_option(view, "--rig", "rig.toml of the simulated rig (the default rig)")
     view.add_argument("--target", metavar="NAME", help="follow this target of rig.toml")
     file_option(view, "--calibration", "calibration.json (the simulation's true calibration)")
+    add_insist(view)
     view.add_argument("--browser", action="store_true", help="serve a page for a web browser on this machine")
     view.add_argument("--port", type=port, metavar="P", help=f"port of the page; 0: any free one ({running.PORT})")
     view.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")

@@ -11,7 +11,7 @@ from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.common import check_outputs, naming, print_json, progress_bar, rig_files, scores_of
+from cotarget.cli.common import check_outputs, load_plausible, naming, print_json, progress_bar, rig_files, scores_of
 from cotarget.errors import ConfigError
 from cotarget.files import STDOUT
 
@@ -30,7 +30,7 @@ LOOKED_AT = ("person", "bird")  # targets of the scene without --rig and --targe
 
 def view_command(options: argparse.Namespace) -> None:
     """Run `cotarget view`: show the simulated scene, with the pipeline at work where a target is named."""
-    from cotarget.calibration import load_calibration
+    from cotarget.backends import describe
     from cotarget.sim.world import SimWorld
 
     if options.port is not None and not options.browser:
@@ -38,7 +38,9 @@ def view_command(options: argparse.Namespace) -> None:
     if options.calibration is not None and options.target is None:
         raise ConfigError("--calibration: is for following a target; name it: --target NAME")
     config = _config(options)
-    calibration = None if options.calibration is None else load_calibration(options.calibration)
+    calibration = None
+    if options.calibration is not None:
+        calibration = load_plausible(options.calibration, describe(config), insist=options.insist)
     opened = window_opener(options)  # called first, because making the world takes a while
     world = SimWorld(config)
     with closing(world), closing(opened(world.truth())) as window:
@@ -119,7 +121,7 @@ def _sights(
         if options.target is None:
             yield from _at_rest(rig, world.truth(), seconds)
         else:
-            yield from _followed(options.target, config, calibration or true_calibration(world), world, rig, seconds)
+            yield from _followed(options, config, calibration or true_calibration(world), world, rig, seconds)
 
 
 def _at_rest(rig: "Rig", truth: "Truth", seconds: float) -> "Iterator[Snapshot]":
@@ -136,15 +138,23 @@ def _at_rest(rig: "Rig", truth: "Truth", seconds: float) -> "Iterator[Snapshot]"
 
 
 def _followed(
-    name: str, config: "RigConfig", calibration: "Calibration", world: "SimWorld", rig: "Rig", seconds: float
+    options: argparse.Namespace,
+    config: "RigConfig",
+    calibration: "Calibration",
+    world: "SimWorld",
+    rig: "Rig",
+    seconds: float,
 ) -> "Iterator[Snapshot]":
     from cotarget.drawing import draw_wide, draw_zoom
     from cotarget.pipeline import follow
     from cotarget.sim.viewer.scene import Snapshot, frusta_of
+    from cotarget.targeting import target_implausibility
 
-    truth = world.truth()
+    truth, name = world.truth(), options.target
     target = config.target(name)
-    for step in follow(rig, calibration, target, seconds=seconds):
+    if not options.insist and (text := target_implausibility(target, calibration, rig.spec, name)):
+        raise ConfigError(f"{options.rig}: {text}; --insist follows it all the same")
+    for step in follow(rig, calibration, target, seconds=seconds, insist=True):
         depths = {} if step.aim is None else {"zoom": step.aim.range}
         caption = f"t = {step.t:.1f} s   {name}: {step.state}"
         pictures = {"fixed": draw_wide(step), "zoom": draw_zoom(step)}

@@ -14,20 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.board import board_points
-from cotarget.calibration.bundle import (
-    EVERY_BLOCK,
-    POSE_PARAMETERS,
-    Fit,
-    fit,
-    parameter_names,
-    predict_pixels,
-    robust_sigma,
-    stepped,
-)
+from cotarget.calibration.bundle import Fit, fit, nudged, predict_pixels, robust_sigma
 from cotarget.calibration.calibrate import tells_pose
 from cotarget.calibration.file import Calibration
 from cotarget.calibration.initialization import place_boards
-from cotarget.calibration.model import CameraName, Covariance, View, stop_of
+from cotarget.calibration.model import CAMERAS, CameraName, Covariance, View
 from cotarget.calibration.observability import name_directions, weak_directions
 from cotarget.calibration.planning import GRID
 from cotarget.calibration.uncertainty import STEP, miss_derivatives, model_of, predicted_pointing
@@ -96,14 +87,11 @@ def _sigmas(calibration: Calibration, nominal_px: Array) -> dict[str, Array]:
     if covariance is None:
         return {}
     model = model_of(calibration)
-    known = parameter_names(EVERY_BLOCK, model.stops)
     own = [i for i, name in enumerate(covariance.parameters) if name.startswith("zoom[")]
     columns = []
     for i in own:
-        step = np.zeros(len(known))
-        step[known.index(covariance.parameters[i])] = STEP
-        ends = [stepped(model, s, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK).zoom_head for s in (step, -step)]
-        plus, minus = (_evaluate(head.lens, nominal_px) for head in ends if head is not None)
+        ends = (nudged(model, covariance.parameters[i], step).head.lens for step in (STEP, -STEP))
+        plus, minus = (_evaluate(lens, nominal_px) for lens in ends)
         columns.append((plus - minus) / (2 * STEP))
     J = np.array(columns)  # (parameters, 6, n)
     variance = np.einsum("pcn,pq,qcn->cn", J, covariance.matrix[np.ix_(own, own)], J)
@@ -154,24 +142,10 @@ class AtFocal:
         return float(np.tan(self.rms)) * self.focal_px
 
 
-@dataclass(frozen=True)
-class Contribution:
-    """Contribution of one group of parameters to the pointing error.
-
-    Attributes:
-        group: name of the group.
-        left: rms pointing error if the group were known exactly [rad].
-    """
-
-    group: str
-    left: float
-
-
-def sample_pixels(calibration: Calibration, cells: tuple[int, int] = POINTING_CELLS) -> Array:
+def sample_pixels(calibration: Calibration) -> Array:
     """List the middles of cells all over the fixed image, (n, 2) [px]."""
-    across, down = (
-        (np.arange(n) + 0.5) / n * side - 0.5 for n, side in zip(cells, calibration.fixed.size, strict=True)
-    )
+    sides = zip(POINTING_CELLS, calibration.fixed.size, strict=True)
+    across, down = ((np.arange(n) + 0.5) / n * side - 0.5 for n, side in sides)
     return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
 
 
@@ -267,15 +241,15 @@ def group_of(parameter: str) -> str:
     return next((name for name, begins in GROUPS if plain.startswith(begins)), parameter)
 
 
-def contributions(calibration: Calibration) -> tuple[Contribution, ...]:
-    """Compute what each group contributes to the error at the longest focal length, the largest first.
+def contributions(calibration: Calibration) -> dict[str, float]:
+    """Compute the rms error at the longest focal length if each group were known [rad], the most important first.
 
     Each group in turn is taken as known exactly, which leaves the conditional covariance of the others. Clearing its
     rows instead would count correlations with the others twice.
     """
     covariance = calibration.covariance
     if not can_point(calibration) or covariance is None:
-        return ()
+        return {}
     pixels, depths = sample_pixels(calibration), sample_depths()
     by_parameter, by_turn = miss_derivatives(
         model_of(calibration),
@@ -286,7 +260,7 @@ def contributions(calibration: Calibration) -> tuple[Contribution, ...]:
     )
     reached = np.isfinite(by_parameter).all(axis=(1, 2))
     if not reached.any():
-        return ()
+        return {}
     J, turned = by_parameter[reached], by_turn[reached]
     weights = np.einsum("nik,nil->kl", J, J) / len(J)  # the mean of trace(J C J^T) is the sum of weights * C
     turns = float(np.sum(turned**2)) / len(J)
@@ -294,13 +268,14 @@ def contributions(calibration: Calibration) -> tuple[Contribution, ...]:
     def rms(matrix: Array, jitter: float) -> float:
         return float(np.sqrt(max(np.sum(weights * matrix) + jitter**2 * turns, 0.0)))
 
-    found = []
-    for group in dict.fromkeys(group_of(name) for name in covariance.parameters):
-        known = np.array([group_of(name) == group for name in covariance.parameters])
-        found.append(Contribution(group, rms(given(covariance, known).matrix, calibration.jitter)))
+    groups = [group_of(name) for name in covariance.parameters]
+    left = {}
+    for group in dict.fromkeys(groups):
+        known = np.array(groups) == group
+        left[group] = rms(given(covariance, known).matrix, calibration.jitter)
     if calibration.jitter:
-        found.append(Contribution(JITTER_GROUP, rms(covariance.matrix, 0.0)))
-    return tuple(sorted(found, key=lambda c: c.left))
+        left[JITTER_GROUP] = rms(covariance.matrix, 0.0)
+    return dict(sorted(left.items(), key=lambda item: item[1]))
 
 
 def given(covariance: Covariance, known: npt.NDArray[np.bool_]) -> Covariance:
@@ -315,7 +290,7 @@ def given(covariance: Covariance, known: npt.NDArray[np.bool_]) -> Covariance:
     return Covariance(covariance.parameters, left * np.outer(scale, scale))
 
 
-def undetermined(calibration: Calibration) -> str:
+def left_open(calibration: Calibration) -> str:
     """Describe what the covariance leaves undetermined, and what to add; empty where all is determined.
 
     The widening by the held-out check is taken out, because it stands for a wrong model, which no views correct.
@@ -332,9 +307,6 @@ def undetermined(calibration: Calibration) -> str:
 # Evidence from the stored corners
 
 TITLES = {"fixed": "fixed camera", "zoom": "zoom camera"}
-
-
-CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 CELLS = (16, 12)  # cells across and down an image, in which residuals are averaged
 FEWEST_IN_CELL = 5  # fewest corners of an average
 BEYOND_CHANCE = 3.0  # standard deviations of a cell's average, which chance exceeds in one cell of 90
@@ -433,9 +405,6 @@ def gather(calibration: Calibration) -> Evidence | None:
     """Fit the boards' poses alone to the stored corners; None where a calibration stores none.
 
     Views whose corners do not determine a pose are left out: too many of their corners may have been rejected.
-
-    Raises:
-        CalibrationError: the stored corners do not determine the boards' poses.
     """
     if calibration.board is None:
         return None
@@ -456,7 +425,7 @@ def gather(calibration: Calibration) -> Evidence | None:
     normals = np.array([T.rotation.as_matrix()[:, 2] for T in boards])
     distances = np.linalg.norm(middles, axis=-1)
     facing = np.abs(np.sum(normals * middles, axis=-1)) / distances
-    stops = [stop_of(calibration.zoom_head.lens.nominal_px, view) for view in views if view.camera == "zoom"]
+    stops = [model.stop_of(view) or 0 for view in views if view.camera == "zoom"]
     return Evidence(
         views=views,
         corners={name: _corners(calibration, found, name) for name in CAMERAS},

@@ -15,10 +15,10 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from cotarget.calibration.file import Calibration
+from cotarget.calibration.model import CAMERAS
 from cotarget.calibration.uncertainty import predicted_pointing
 from cotarget.geometry import Array
 from cotarget.report.analysis import (
-    CAMERAS,
     DEPTHS,
     TITLES,
     AtFocal,
@@ -58,13 +58,7 @@ def map_figure(calibration: Calibration, at: AtFocal) -> Figure:
         axes = figure.subplots(1, MAP_DEPTHS, sharey=True)
         for ax, depth, error in zip(axes, depths, errors, strict=True):
             as_image(ax, (width, height))
-            drawn = ax.imshow(
-                error,
-                norm=norm,
-                cmap=HEAT,
-                interpolation="bilinear",
-                extent=(-0.5, width - 0.5, height - 0.5, -0.5),
-            )
+            drawn = ax.imshow(error, norm=norm, cmap=HEAT, interpolation="bilinear", extent=extent((width, height)))
             inside = levels[(levels > np.nanmin(error)) & (levels < np.nanmax(error))]
             if len(inside):
                 lines = ax.contour(u, v, error, inside, colors="white", linewidths=0.8)
@@ -113,9 +107,7 @@ def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) ->
         if len(boards):
             ax.plot(boards, np.zeros(len(boards)), "|", color=INK, ms=12, clip_on=False, label="boards")
         ax.set(xscale="log", xlabel="depth [m]", ylabel="predicted error [degrees]", xlim=(depths[0], depths[-1]))
-        ticks = [t for t in (1, 2, 5, 10, 20, 50, 100) if depths[0] <= t <= depths[-1]]
-        ax.set_xticks(ticks, [str(t) for t in ticks])
-        ax.minorticks_off()
+        log_ticks(ax, [t for t in (1, 2, 5, 10, 20, 50, 100) if depths[0] <= t <= depths[-1]])
         px = ax.secondary_yaxis("right", functions=_pixels(at.focal_px))
         px.set_ylabel(f"[px] at {at.focal_px:.0f} px")
         ax.legend(ncols=2, fontsize=8)
@@ -214,15 +206,33 @@ def as_bytes(figure: Figure, kind: str, dpi: int = PNG_DPI) -> bytes:
     return buffer.getvalue()
 
 
+def extent(size: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Compute where an image of a size (width, height) [px] begins and ends on axes in pixels."""
+    return -0.5, size[0] - 0.5, size[1] - 0.5, -0.5
+
+
 def as_image(ax: Any, size: tuple[int, int]) -> None:
     """Set axes up as an image of a size (width, height) [px]."""
     width, height = size
-    ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    left, right, bottom, top = extent(size)
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     ax.grid(visible=False)
     ax.set_xticks([0, width // 2, width])
     ax.set_yticks([0, height // 2, height])
     for spine in ax.spines.values():
         spine.set_visible(True)
+
+
+def log_ticks(ax: Any, values: Sequence[float] | Array, form: str = "g") -> None:
+    """Label a logarithmic axis at some values alone."""
+    ax.set_xticks(values, [format(value, form) for value in values])
+    ax.minorticks_off()
+
+
+def arrows(ax: Any, at: Array, vectors: Array, *colour: Array, **style: Any) -> Any:
+    """Draw vectors (n, 2) at pixels (n, 2), in the axes' units."""
+    # An arrow out of the image does not change the layout.
+    return ax.quiver(*at.T, *vectors.T, *colour, angles="xy", scale_units="xy", scale=1, in_layout=False, **style)
 
 
 def magnification(corners: Corners) -> float:
@@ -242,44 +252,28 @@ def residual_figure(evidence: Evidence) -> Figure:
             corners = evidence.corners[name]
             factor = magnification(corners)
             as_image(row[0], corners.size)
-            _arrows(row[0], corners.seen_px, corners.residuals, factor, np.linalg.norm(corners.residuals, axis=-1))
+            lengths = np.linalg.norm(corners.residuals, axis=-1)
+            order = np.argsort(lengths)
+            drawn = arrows(
+                row[0],
+                corners.seen_px[order],
+                factor * corners.residuals[order],
+                lengths[order],
+                width=0.0014,
+                cmap="viridis_r",
+                alpha=0.75,
+                clim=(0, np.percentile(lengths, 99)),
+            )
+            figure.colorbar(drawn, ax=row[0], label="length [px]", shrink=0.8, pad=0.02)
             row[0].set_title(f"{TITLES[name]}: every corner, ×{factor:g}")
             cells = averaged(corners)
             factor = magnification(corners) * 4
             as_image(row[1], corners.size)
             row[1].scatter(*corners.seen_px.T, s=1.5, color=PALE, lw=0)
             for those, colour in ((~cells.beyond_chance, GREY), (cells.beyond_chance, RED)):
-                middles, means = cells.middles[those], cells.means[those]
-                row[1].quiver(
-                    *middles.T,
-                    *(factor * means).T,
-                    color=colour,
-                    angles="xy",
-                    scale_units="xy",
-                    scale=1,
-                    width=0.004,
-                    in_layout=False,  # an arrow out of the image does not change the layout
-                )
+                arrows(row[1], cells.middles[those], factor * cells.means[those], color=colour, width=0.004)
             row[1].set_title(f"{TITLES[name]}: averages, ×{factor:g}")
         return figure
-
-
-def _arrows(ax: Any, at: Any, residuals: Any, factor: float, lengths: Any) -> None:
-    order = np.argsort(lengths)
-    drawn = ax.quiver(
-        *at[order].T,
-        *(factor * residuals[order]).T,
-        lengths[order],
-        angles="xy",
-        scale_units="xy",
-        scale=1,
-        width=0.0014,
-        cmap="viridis_r",
-        alpha=0.75,
-        clim=(0, np.percentile(lengths, 99) if len(lengths) else 1),
-        in_layout=False,
-    )
-    ax.figure.colorbar(drawn, ax=ax, label="length [px]", shrink=0.8, pad=0.02)
 
 
 def histogram_figure(evidence: Evidence) -> Figure:
@@ -317,13 +311,7 @@ def coverage_figure(evidence: Evidence) -> Figure:
             corners = evidence.corners[name]
             as_image(ax, corners.size)
             number = counts(corners)
-            width, height = corners.size
-            drawn = ax.imshow(
-                np.where(number > 0, number, np.nan),
-                cmap="Blues",
-                vmin=0,
-                extent=(-0.5, width - 0.5, height - 0.5, -0.5),
-            )
+            drawn = ax.imshow(np.where(number > 0, number, np.nan), cmap="Blues", vmin=0, extent=extent(corners.size))
             ax.set_facecolor("#f6d9d5")
             ax.scatter(*corners.seen_px.T, s=0.8, color=INK, lw=0, alpha=0.5)
             ax.set_title(TITLES[name])
@@ -340,9 +328,7 @@ def situation_figure(evidence: Evidence, nominal_px: tuple[float, ...], has_head
         edges = np.geomspace(evidence.distances.min() * 0.98, evidence.distances.max() * 1.02, 11)
         ax.hist(evidence.distances, edges, color=BLUE, alpha=0.8)
         ax.set(title="distance of the boards", xlabel="[m]", ylabel="placements", xscale="log")
-        ticks = np.unique([float(f"{t:.2g}") for t in np.geomspace(edges[0], edges[-1], 4)])
-        ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
-        ax.minorticks_off()
+        log_ticks(ax, np.unique([float(f"{t:.2g}") for t in np.geomspace(edges[0], edges[-1], 4)]))
         ax = axes.pop(0)
         ax.hist(np.degrees(evidence.leanings), np.arange(0, 91, 7.5), color=BLUE, alpha=0.8)
         ax.set(title="turned from facing", xlabel="[degrees]", ylabel="placements", xlim=(0, 90))
@@ -391,8 +377,7 @@ def lens_figure(curves: LensCurves) -> Figure:
 def focal_ticks(ax: Any, stops_px: Sequence[float]) -> None:
     """Label zoom samples on a logarithmic axis, as many as there is room for."""
     shown = stops_px if len(stops_px) <= 7 else stops_px[:: -(-len(stops_px) // 6)]
-    ax.set_xticks(shown, [f"{n:.0f}" for n in shown])
-    ax.minorticks_off()
+    log_ticks(ax, shown, ".0f")
 
 
 # All figures with their captions

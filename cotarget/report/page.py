@@ -11,15 +11,14 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from cotarget.calibration.file import Calibration, check_covariance
+from cotarget.calibration.file import Calibration
+from cotarget.calibration.model import CAMERAS
 from cotarget.errors import ConfigError
 from cotarget.report import figures
 from cotarget.report.analysis import (
-    CAMERAS,
     DEPTHS,
     TITLES,
     AtFocal,
-    Contribution,
     Evidence,
     averaged,
     between_stops,
@@ -34,7 +33,6 @@ from cotarget.report.text import (
     LABELS,
     STRONG,
     TOO_CAREFUL,
-    Table,
     Verdict,
     advice,
     board_in_words,
@@ -45,7 +43,6 @@ from cotarget.report.text import (
     key_figures,
     parameter_tables,
     percent,
-    provenance,
 )
 
 FOLDED_FROM = 8  # number of rejected images from which their list is folded
@@ -89,17 +86,16 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
         The verdict.
 
     Raises:
-        CalibrationError: the covariance is invalid, or the stored corners do not determine the boards' poses.
+        CalibrationError: the stored corners do not determine the boards' poses.
         ConfigError: a file cannot be written.
     """
-    if calibration.covariance is not None:
-        check_covariance(calibration.covariance, len(calibration.zoom_head.lens.stops))
     at = pointing(calibration)
     between = pointing(calibration, between_stops(calibration))
     evidence = gather(calibration)
     found = judge(calibration, at, between, evidence)
     parts = contributions(calibration)
     made = figures.draw(calibration, at, between, evidence)
+    used = calibration.residuals
     when, method = (calibration.provenance.get(key) for key in ("when", "method"))
     page = render(
         "calibration.html",
@@ -111,16 +107,14 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
         calibration=calibration,
         figures=made,
         key_figures=key_figures(calibration),
-        provenance=provenance(calibration),
         pointing=_pointing(calibration, at, parts),
         tables=parameter_tables(calibration),
         two_columns=TWO_COLUMNS,
         correlations=correlations(calibration),
         strong=STRONG,
         residuals=None if evidence is None else _residuals(evidence),
-        held_out_table=_held_out(calibration),
         too_careful=TOO_CAREFUL,
-        rejected=_rejected(calibration),
+        rejected=[] if used is None else [(one.name, one.reason) for one in used.rejected],
         folded_from=FOLDED_FROM,
         advice=advice(calibration, at, between, parts, evidence),
     )
@@ -147,9 +141,7 @@ def _write(path: Path, page: str, made: dict[str, Plot]) -> None:
         raise ConfigError(f"{where}: cannot be written: {error.strerror}") from None
 
 
-def _pointing(
-    calibration: Calibration, at: tuple[AtFocal, ...], parts: tuple[Contribution, ...]
-) -> dict[str, Any] | None:
+def _pointing(calibration: Calibration, at: tuple[AtFocal, ...], parts: dict[str, float]) -> dict[str, Any] | None:
     """Compute what the page says of the predicted error; None where nothing can be predicted."""
     if not at or not np.isfinite(at[-1].rms):
         return None
@@ -161,7 +153,7 @@ def _pointing(
         "rms": total,
         "middle": middle,
         "worst": max(corners.values(), default=np.nan),
-        "gains": [(part.group, 1 - part.left / total) for part in parts if total > 0],
+        "gains": [(group, 1 - left / total) for group, left in parts.items() if total > 0],
     }
 
 
@@ -181,24 +173,3 @@ def _residuals(evidence: Evidence) -> list[str]:
             "makes it (one in 90 of noise alone)."
         )
     return [*lines, board_in_words(evidence.shape)]
-
-
-def _held_out(calibration: Calibration) -> Table | None:
-    """Make the table of the captures kept out of the fit; None where there were none."""
-    held_out = calibration.held_out
-    if held_out is None:
-        return None
-    rows = (
-        ("distance measured", f"{digits(held_out.measured_px, 3)} px"),
-        ("distance predicted", f"{digits(held_out.predicted_px, 3)} px"),
-        ("single corners, their board's pose fitted", f"{digits(held_out.corners_rms_px, 3)} px"),
-        ("every distance over what was predicted of it", digits(held_out.ratio, 3)),
-    )
-    note = f"Of {count(held_out.views, 'view')} of the zoom camera, brought to the shortest focal length."
-    return Table("", ("", "rms"), rows, note)
-
-
-def _rejected(calibration: Calibration) -> Table:
-    """Make the table of images that were not used."""
-    rejected = calibration.residuals.rejected if calibration.residuals is not None else ()
-    return Table("", ("image", "reason"), tuple((each.name, each.reason) for each in rejected))

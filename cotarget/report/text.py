@@ -10,20 +10,19 @@ import numpy as np
 
 from cotarget.calibration.bundle import LENS_NAMES
 from cotarget.calibration.file import Calibration
+from cotarget.calibration.model import CAMERAS
 from cotarget.calibration.observability import BOTH, NEARER, OUTWARD, TILT_BOARDS
 from cotarget.calibration.planning import distance
 from cotarget.camera import Intrinsics
 from cotarget.geometry import RigidTransform
 from cotarget.pantilt import IDEAL_HEAD
 from cotarget.report.analysis import (
-    CAMERAS,
     DEPTHS,
     JITTER_GROUP,
     MORE_PLACEMENTS,
     TITLES,
     AtFocal,
     BoardShape,
-    Contribution,
     Evidence,
     averaged,
     between_stops,
@@ -31,11 +30,11 @@ from cotarget.report.analysis import (
     empty_places,
     gather,
     head_poses,
+    left_open,
     placements,
     pointing,
     sigma_of,
     uncalibrated_px,
-    undetermined,
     what_stays,
     with_more_placements,
 )
@@ -64,18 +63,10 @@ def advice(
     calibration: Calibration,
     at: tuple[AtFocal, ...],
     between: tuple[AtFocal, ...],
-    parts: tuple[Contribution, ...],
+    parts: dict[str, float],
     evidence: Evidence | None,
 ) -> list[str]:
-    """Advise how to improve a calibration, roughly the most useful first; empty where nothing stands out.
-
-    Args:
-        calibration: the calibration.
-        at: `pointing` at its zoom samples.
-        between: `pointing` between them.
-        parts: its `contributions`.
-        evidence: evidence from its corners, or None.
-    """
+    """Advise how to improve a calibration, roughly the most useful first; empty where nothing stands out."""
     items = [*_disagreement(calibration), *_missing(calibration), *_unconfirmed(calibration)]
     items += [*_largest_part(at, parts), *_between_stops(at, between), *_worst_corner(calibration, at)]
     if evidence is not None:
@@ -86,7 +77,7 @@ def advice(
 
 def _missing(calibration: Calibration) -> Iterator[str]:
     """Advise on what the calibration lacks: undetermined parameters, a head, a covariance."""
-    if open_ := undetermined(calibration):
+    if open_ := left_open(calibration):
         yield f"Add what is missing: {open_}."
     if calibration.zoom_head.T_head_zoom is None:
         yield "Calibrate on a rig whose head moves: two cameras alone cannot be pointed."
@@ -118,25 +109,24 @@ def _unconfirmed(calibration: Calibration) -> Iterator[str]:
         )
 
 
-def _largest_part(at: tuple[AtFocal, ...], parts: tuple[Contribution, ...]) -> Iterator[str]:
+def _largest_part(at: tuple[AtFocal, ...], parts: dict[str, float]) -> Iterator[str]:
     """Advise on the groups of parameters that contribute most to the error."""
     total = at[-1].rms if at else 0.0
     if not total > 0:
         return
-    for part in parts[:2]:
-        share = 1 - (part.left / total) ** 2
+    for group, left in list(parts.items())[:2]:
+        share = 1 - (left / total) ** 2
         if not share > WORTH_SAYING:
             return
-        gain = f"the error would be {_degrees(part.left)} instead of {_degrees(total)} degrees"
-        if part.group == JITTER_GROUP:
+        gain = f"the error would be {_degrees(left)} instead of {_degrees(total)} degrees"
+        if group == JITTER_GROUP:
             yield (
                 f"The head itself makes {percent(share)} of the squared error; without its jitter {gain}. Look for "
                 "play in the gears, cables that pull, a mount that gives way, and wait longer after a move; more "
                 "captures will not help."
             )
         else:
-            action = ACTIONS.get(part.group, BOTH)
-            yield f"Were {part.group} known exactly, {gain}: {action}."
+            yield f"Were {group} known exactly, {gain}: {ACTIONS.get(group, BOTH)}."
 
 
 def _between_stops(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Iterator[str]:
@@ -310,29 +300,33 @@ class Table:
     note: str = ""
 
 
+HEADER = ("parameter", "value ± σ", "unit")
+
+
 def parameter_tables(calibration: Calibration) -> list[Table]:
     """Make tables of all parameters in groups, with value ± one standard deviation."""
-    header = ("parameter", "value ± σ", "unit")
-    fixed = Table(
-        "Fixed camera", header, tuple(_lens(calibration, calibration.fixed.lens, "fixed")), _about_k3(calibration)
-    )
-    tables = [fixed, *_zoom(calibration)]
-    tables.append(
-        _pose_table(calibration, "Offset between the cameras", "T_zoom0_fixed", calibration.zoom_head.T_zoom0_fixed)
-    )
-    if calibration.zoom_head.T_head_zoom is not None:
-        title = "Place of the zoom camera on the head"
-        tables.append(_pose_table(calibration, title, "T_head_zoom", calibration.zoom_head.T_head_zoom))
-        tables.append(Table("Pan-tilt head", header, tuple(_head(calibration))))
+    head = calibration.zoom_head
+    fixed = _lens(calibration, calibration.fixed.lens, "fixed")
+    tables = [Table("Fixed camera", HEADER, fixed, _about_k3(calibration)), *_zoom(calibration)]
+    tables.append(_pose_table(calibration, "Offset between the cameras", "T_zoom0_fixed", head.T_zoom0_fixed))
+    if head.T_head_zoom is not None:
+        tables.append(_pose_table(calibration, "Place of the zoom camera on the head", "T_head_zoom", head.T_head_zoom))
+        tables.append(Table("Pan-tilt head", HEADER, tuple(_head(calibration))))
     if calibration.board is not None:
-        rows = zip(("x", "y"), calibration.board_warp, strict=True)
-        tables.append(Table("Board", header, tuple(_bend(calibration, axis, value) for axis, value in rows)))
+        rows = [
+            _row(calibration, f"board.warp_{axis}", f"bulge of its middle along {axis}", value, 1000.0, "mm")
+            for axis, value in zip("xy", calibration.board_warp, strict=True)
+        ]
+        tables.append(Table("Board", HEADER, tuple(rows)))
     return tables
 
 
-def _bend(calibration: Calibration, axis: str, value: float) -> tuple[str, ...]:
-    sigma = sigma_of(calibration, f"board.warp_{axis}")
-    return f"bulge of its middle along {axis}", value_and_sigma(1000 * value, sigma and 1000 * sigma), "mm"
+def _row(
+    calibration: Calibration, name: str, words: str, value: float, factor: float = 1.0, unit: str = ""
+) -> tuple[str, str, str]:
+    """Make the row of a parameter, multiplied by a factor to the unit shown."""
+    sigma = sigma_of(calibration, name)
+    return words, value_and_sigma(factor * value, sigma and factor * sigma), unit
 
 
 def _held(lens: Intrinsics) -> str:
@@ -352,26 +346,22 @@ def _numbers(lens: Intrinsics) -> dict[str, float]:
     return dict(zip(LENS_NAMES, (*lens.focal_px, *lens.center_px, *lens.distortion), strict=False))
 
 
-def _lens(calibration: Calibration, lens: Intrinsics, owner: str) -> Iterator[tuple[str, ...]]:
-    for name, value in _numbers(lens).items():
-        words, unit = LENS_WORDS[name]
-        yield words, value_and_sigma(value, sigma_of(calibration, f"{owner}.{name}")), unit
+def _lens(calibration: Calibration, lens: Intrinsics, owner: str) -> tuple[tuple[str, ...], ...]:
+    return tuple(
+        _row(calibration, f"{owner}.{name}", words, _numbers(lens)[name], unit=unit)
+        for name, (words, unit) in LENS_WORDS.items()
+    )
 
 
 def _zoom(calibration: Calibration) -> list[Table]:
     lens = calibration.zoom_head.lens
     if len(lens.stops) == 1:
         title = f"Zoom camera (nominal focal length {lens.nominal_px[0]:.0f} px)"
-        rows = tuple(_lens(calibration, lens.stops[0], "zoom[0]"))
-        return [Table(title, ("parameter", "value ± σ", "unit"), rows, _held(lens.stops[0]))]
+        return [Table(title, HEADER, _lens(calibration, lens.stops[0], "zoom[0]"), _held(lens.stops[0]))]
     lengths, bent = [], []
     for i, (nominal, stop, pupil) in enumerate(zip(lens.nominal_px, lens.stops, lens.pupil, strict=True)):
-        cells = {
-            name: value_and_sigma(value, sigma_of(calibration, f"zoom[{i}].{name}"))
-            for name, value in _numbers(stop).items()
-        }
-        sigma = sigma_of(calibration, f"zoom[{i}].pupil")
-        moved = "0" if i == 0 else value_and_sigma(1000 * pupil, None if sigma is None else 1000 * sigma)
+        cells = {name: _row(calibration, f"zoom[{i}].{name}", "", value)[1] for name, value in _numbers(stop).items()}
+        moved = _row(calibration, f"zoom[{i}].pupil", "", pupil, 1000.0)[1] if i else "0"
         first = f"{nominal:.0f}"
         lengths.append((first, cells["fx"], cells["fy"], cells["cx"], cells["cy"], moved))
         bent.append((first, *(cells[name] for name in ("k1", "k2", "p1", "p2"))))
@@ -387,17 +377,15 @@ def _zoom(calibration: Calibration) -> list[Table]:
 
 
 def _pose_table(calibration: Calibration, title: str, name: str, T: RigidTransform) -> Table:
-    rows = []
-    for axis, value in zip("xyz", 1000 * T.translation, strict=True):
-        sigma = sigma_of(calibration, f"{name}.t{axis}")
-        rows.append((f"position {axis}", value_and_sigma(value, sigma and 1000 * sigma), "mm"))
-    for axis, value in zip("xyz", T.rotation.as_rotvec(degrees=True), strict=True):
-        sigma = sigma_of(calibration, f"{name}.r{axis}")
-        rows.append((f"rotation vector {axis}", value_and_sigma(value, sigma and np.degrees(sigma)), "degrees"))
+    places, turns = zip("xyz", T.translation, strict=True), zip("xyz", T.rotation.as_rotvec(), strict=True)
+    rows = [_row(calibration, f"{name}.t{axis}", f"position {axis}", v, 1000.0, "mm") for axis, v in places]
+    rows += [
+        _row(calibration, f"{name}.r{axis}", f"rotation vector {axis}", v, 180 / np.pi, "degrees") for axis, v in turns
+    ]
     length = 1000 * float(np.linalg.norm(T.translation))
     rows.append(("distance", value_and_sigma(length, _length_sigma_mm(calibration, name, T)), "mm"))
     note = "The uncertainty of the rotation is that of a turn about the axes of the frame that the transform leads to."
-    return Table(f"{title} ({name})", ("parameter", "value ± σ", "unit"), tuple(rows), note)
+    return Table(f"{title} ({name})", HEADER, tuple(rows), note)
 
 
 def _length_sigma_mm(calibration: Calibration, name: str, T: RigidTransform) -> float | None:
@@ -412,10 +400,13 @@ def _length_sigma_mm(calibration: Calibration, name: str, T: RigidTransform) -> 
 
 def _head(calibration: Calibration) -> Iterator[tuple[str, ...]]:
     for name, (words, factor, unit) in HEAD_WORDS.items():
-        value, sigma = getattr(calibration.zoom_head.axes, name), sigma_of(calibration, f"head.{name}")
-        if sigma is None and name.startswith(("pan", "tilt")) and value == getattr(IDEAL_HEAD, name):
-            continue
-        yield words, value_and_sigma(factor * value, sigma and factor * sigma), unit
+        value, parameter = getattr(calibration.zoom_head.axes, name), f"head.{name}"
+        if (
+            not name.startswith(("pan", "tilt"))
+            or sigma_of(calibration, parameter)
+            or value != getattr(IDEAL_HEAD, name)
+        ):
+            yield _row(calibration, parameter, words, value, factor, unit)
     yield "jitter of each axis", digits(float(np.degrees(calibration.jitter))), "degrees"
 
 
@@ -475,12 +466,6 @@ def key_figures(calibration: Calibration) -> list[tuple[str, str]]:
     names = {"method": "Method", "when": "Made", "cotarget": "Version of cotarget"}
     found += [(word, str(calibration.provenance[key])) for key, word in names.items() if key in calibration.provenance]
     return found
-
-
-def provenance(calibration: Calibration) -> Table:
-    """Make the table of the calibration's provenance."""
-    rows = tuple((str(key), str(value)) for key, value in calibration.provenance.items())
-    return Table("", ("what", "value"), rows)
 
 
 # Number formatting
@@ -571,20 +556,13 @@ def judge(
     between: tuple[AtFocal, ...] | None = None,
     evidence: Evidence | None = None,
 ) -> Verdict:
-    """Judge how well a calibration points.
-
-    Args:
-        calibration: calibration by any method.
-        at: `pointing` at its zoom samples; None to compute it.
-        between: `pointing` at `between_stops`; None to compute it.
-        evidence: evidence from its corners, as `gather` returns it; None to compute it.
-    """
+    """Judge how well a calibration points."""
     if calibration.zoom_head.T_head_zoom is None:
         return Verdict(_without_head(calibration), "unknown")
     if calibration.covariance is None:
         return _without_covariance(calibration)
     mismatch = _mismatch(calibration)
-    if open_ := undetermined(calibration):
+    if open_ := left_open(calibration):
         return Verdict(_sentence([*mismatch, f"does not determine the rig: {open_}"]), "bad")
     evidence = gather(calibration) if evidence is None else evidence
     if evidence is not None and _contradicts(calibration, evidence):
@@ -596,31 +574,25 @@ def judge(
     if not np.isfinite(at[-1].rms):
         return Verdict("Reaches no point of the fixed image with the head: its geometry cannot be right.", "bad")
     width = calibration.zoom_head.lens.size[0]
-    level: Level = "care" if mismatch or calibration.held_out is None else "good"
-    parts = [*mismatch, _how_well(at, between)]
+    doubts, agreed, held_out = [], [], calibration.held_out
     if at[-1].rms_px > FAR_OFF * width:
-        level = "bad" if at[-1].rms_px > OUT_OF_SIGHT * width else "care"
-        parts.append(f"that is {percent(at[-1].rms_px / width)} of the close-up's width")
+        doubts.append(f"that is {percent(at[-1].rms_px / width)} of the close-up's width")
     if (longest := uncalibrated_px(calibration)) is not None:
-        level = "care" if level == "good" else level
-        parts.append(f"the lens goes to {longest:.0f} px by its own account, and nothing is known of it beyond these")
+        doubts.append(f"the lens goes to {longest:.0f} px by its own account, and nothing is known of it beyond these")
     if calibration.jitter:
-        level = "care" if level == "good" else level
-        parts.append(_jitter(calibration, at[-1]))
+        doubts.append(_jitter(calibration, at[-1]))
     if evidence is not None and evidence.shape.wrong:
-        level = "care" if level == "good" else level
         size = digits(1000 * np.hypot(evidence.shape.within, evidence.shape.out))
-        parts.append(f"not counting that the board's corners are {size} mm off where they are believed to be")
-    if calibration.held_out is None:
-        parts.append("no captures were kept out of the fit to confirm it")
-    elif calibration.held_out.ratio < TOO_CAREFUL:
-        level = "care" if level == "good" else level
-        parts.append(
-            f"captures kept out of the fit miss only {digits(calibration.held_out.ratio)} times as far as that"
-        )
+        doubts.append(f"not counting that the board's corners are {size} mm off where they are believed to be")
+    if held_out is None:
+        doubts.append("no captures were kept out of the fit to confirm it")
+    elif held_out.ratio < TOO_CAREFUL:
+        doubts.append(f"captures kept out of the fit miss only {digits(held_out.ratio)} times as far as that")
     elif not mismatch:
-        parts.append("captures kept out of the fit agree")
-    return Verdict(_sentence(parts), level)
+        agreed.append("captures kept out of the fit agree")
+    is_bad = at[-1].rms_px > OUT_OF_SIGHT * width
+    level: Level = "bad" if is_bad else "care" if mismatch or doubts else "good"
+    return Verdict(_sentence([*mismatch, _how_well(at, between), *doubts, *agreed]), level)
 
 
 def _sentence(parts: list[str]) -> str:
@@ -683,7 +655,7 @@ def _without_head(calibration: Calibration) -> str:
     if residuals is not None and residuals.stereo_rms_px is not None:
         parts.append(f"the two cameras agree on the corners to {digits(residuals.stereo_rms_px)} px")
     if covariance is not None:
-        if open_ := undetermined(calibration):
+        if open_ := left_open(calibration):
             parts.append(f"it does not determine the cameras either: {open_}")
         else:
             turn, shift = (

@@ -24,7 +24,7 @@ from cotarget.calibration.model import BundleModel, View
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import base_head
-from cotarget.rig_geometry import ZoomHead
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Truth
 from experiments.calibration.synthetic.views import noisy, seen_from
 from experiments.engine.checks import check_above, check_least
@@ -81,15 +81,15 @@ def one(_: None, settings: HandEyeSettings, seed: int) -> list[Row]:
     closed = park_martin(*motions(heads, seen))
     weighted = solve_hand_eye(heads, seen, middle=middle)
     board = (truth.gamma.inv() * closed.inv() * heads[0] * closed) * seen[0]
-    start = BundleModel({0: board}, zoom_head=ZoomHead(ZoomLens((NOMINAL_PX,), (lens,)), truth.gamma, closed))
+    zoom_head = ZoomHead(ZoomLens((NOMINAL_PX,), (lens,)), truth.gamma, closed)
+    start = BundleModel({0: board}, FixedCamera(lens), zoom_head)  # without views of the fixed camera
     joint = fit(start, views, points, {"hand"})
     inverse = np.asarray(np.linalg.inv(joint.normal), float)
     assert joint.variance is not None
-    assert joint.model.zoom_head is not None
     found: dict[str, tuple[RigidTransform, Array | None]] = {
         "Park and Martin": (closed, None),
         "poses, weighted": (weighted.X, weighted.covariance),
-        "joint fit": (joint.model.zoom_head.hand_eye(), inverse * joint.variance),
+        "joint fit": (joint.model.head.hand_eye(), inverse * joint.variance),
     }
     bound = inverse * settings.noise_px**2
     return [_row(seed, method, X, covariance, bound, truth.hand) for method, (X, covariance) in found.items()]

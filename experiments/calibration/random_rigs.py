@@ -135,9 +135,7 @@ def by_chance(calibration: Calibration, pixels: Array, depths: Array, rng: np.ra
         step = np.zeros(len(names))
         step[columns] = drawn
         other = stepped(model, step, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK)
-        assert other.fixed is not None
-        assert other.zoom_head is not None
-        wrong = replace(calibration, fixed=other.fixed, zoom_head=other.zoom_head)
+        wrong = replace(calibration, fixed=other.fixed, zoom_head=other.head)
         beyond += rms(misses(wrong, truth, pixels, depths)) > WITHIN * predicted
     return beyond / CHANCE_DRAWS
 

@@ -73,7 +73,7 @@ def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
         return true_calibration(SimWorld(config, rendered=()))
     world = SimWorld(config)
     with guard(world.rig, config.safety) as safe:
-        return calibrate(safe, config.board, pitch_mm=config.sim.zoom.pitch_mm, seed=config.sim.seed)
+        return calibrate(safe, config.board, seed=config.sim.seed)
 
 
 # Calibration of a rig, from rendered boards or exact; shared by all experiments in the field with that rig.

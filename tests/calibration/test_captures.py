@@ -1,4 +1,4 @@
-"""An index of captures that somebody edited, or that lost its images: refused in one line that names the place."""
+"""Captures and photos on disk: what somebody edited, or what lost its images, is refused in one line by name."""
 
 import json
 
@@ -6,81 +6,90 @@ import cv2
 import numpy as np
 import pytest
 
+from cotarget.calibration import calibrate_captures, calibrate_photos
 from cotarget.calibration.captures import INDEX, pair_photos, read_images, read_index
+from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 
 FIXED = {"file": "a.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 2.0}
 ZOOM = {"file": "b.png", "camera": "zoom", "board": 0, "pan": 0.1, "tilt": -0.2, "focal_px": 667.0, "t": 1.0}
+BOARD = {"kind": "chessboard", "corners": [9, 6], "square": 0.1}
+LARGE, SMALL = (48, 64), (24, 32)  # height and width [px]
+
+
+def images(folder, sizes):
+    for name, size in sizes.items():
+        cv2.imwrite(str(folder / name), np.zeros((*size, 3), np.uint8))
+    return folder
 
 
 @pytest.fixture
 def folder(tmp_path):
-    for name, size in (("a.png", (48, 64)), ("b.png", (48, 64)), ("small.png", (24, 32)), ("unlisted.png", (8, 8))):
-        cv2.imwrite(str(tmp_path / name), np.zeros((*size, 3), np.uint8))
-    return tmp_path
+    (tmp_path / "text.png").write_text("no image")
+    return images(tmp_path, {"a.png": LARGE, "b.png": LARGE, "small.png": SMALL, "unlisted.png": SMALL})
 
 
-def write(folder, rows, kind="chessboard"):
-    table = {"schema": 1, "board": {"kind": kind, "corners": [9, 6], "square": 0.1}, "pitch_mm": None}
-    (folder / INDEX).write_text(json.dumps(table | {"captures": rows}))
+def write(folder, rows, **changes):
+    table = {"schema": 1, "board": BOARD, "pitch_mm": None, "captures": rows} | changes
+    (folder / INDEX).write_text(json.dumps(table))
 
 
 def test_order_and_unlisted_images_do_no_harm(folder):
-    write(folder, [FIXED, ZOOM], kind="charuco")
+    write(folder, [FIXED | {"pan": None, "tilt": None}, ZOOM], board=BOARD | {"kind": "charuco"})
     index = read_index(folder)
     assert index.board.kind == "charuco"
     assert [capture.t for capture in read_images(folder, index.captures)] == [2.0, 1.0]
+    assert index.captures[0].pan == 0.0
 
 
-def test_the_fixed_camera_needs_no_angles(folder):
-    write(folder, [FIXED | {"pan": None, "tilt": None}])
-    assert read_index(folder).captures[0].pan == 0.0
-
-
-@pytest.mark.parametrize(("rows", "said"), [
-    ([FIXED, ZOOM | {"file": "c.png"}], r"captures\[1\].file: c.png: no such file"),
-    ([FIXED, ZOOM, FIXED], r"captures\[2\].file: a.png is captures\[0\] already"),
-    ([FIXED, FIXED | {"file": "./a.png"}], r"captures\[1\].file: a.png is captures\[0\] already"),
-    ([FIXED | {"camera": "wide"}], r"captures\[0\].camera: 'wide' is not one of: fixed, zoom"),
-    ([FIXED | {"board": -1}], r"captures\[0\].board: -1"),
-    ([FIXED | {"board": 1.5}], r"captures\[0\].board"),
-    ([FIXED, ZOOM | {"pan": None}], r"captures\[1\].pan: is missing; .* needs the head's pan and tilt"),
-    ([{k: v for k, v in ZOOM.items() if k != "tilt"}], r"captures\[0\].tilt: is missing"),
-    ([ZOOM | {"pan": 90.0}], r"captures\[0\].pan: 90 .* looks like degrees"),
-    ([ZOOM | {"tilt": -31}], r"captures\[0\].tilt: -31 .* looks like degrees"),
-    ([FIXED, FIXED | {"file": "small.png"}], "small.png: is 32x24 px where a.png of the same camera is 64x48"),
+@pytest.mark.parametrize(("rows", "changes", "said"), [
+    ([], {}, "captures: "),
+    ([FIXED], {"schema": 2}, "schema 2"),
+    ([FIXED], {"board": BOARD | {"kind": "circles"}}, "board.kind"),
+    ([FIXED], {"board": {"kind": "chessboard", "corners": [9, 6]}}, "board: missing key 'square'"),
+    ([FIXED, ZOOM | {"file": "c.png"}], {}, "captures[1].file: c.png"),
+    ([FIXED, ZOOM, FIXED], {}, "captures[2].file: a.png"),
+    ([FIXED, FIXED | {"file": "./a.png"}], {}, "captures[1].file: a.png"),
+    ([FIXED | {"file": "../a.png"}], {}, "captures[0].file"),
+    ([FIXED | {"camera": "wide"}], {}, "captures[0].camera"),
+    ([FIXED | {"board": -1}], {}, "captures[0].board"),
+    ([FIXED, ZOOM | {"pan": None}], {}, "captures[1].pan"),
+    ([{k: v for k, v in ZOOM.items() if k != "tilt"}], {}, "captures[0].tilt"),
+    ([ZOOM | {"tilt": "up"}], {}, "captures[0].tilt"),
+    ([ZOOM | {"pan": 90.0}], {}, "captures[0].pan: 90"),
+    ([FIXED], {}, "zoom camera"),
+    ([FIXED | {"file": "text.png"}, ZOOM], {}, "text.png"),
+    ([FIXED, FIXED | {"file": "small.png"}, ZOOM], {}, "small.png: is 32x24 px"),
 ])  # fmt: skip
-def test_what_makes_no_sense_is_refused_by_name(folder, rows, said):
-    write(folder, rows)
-    with pytest.raises(CalibrationError, match=said) as caught:
-        list(read_images(folder, read_index(folder).captures))
+def test_what_makes_no_sense_is_refused_by_name(folder, rows, changes, said):
+    write(folder, rows, **changes)
+    with pytest.raises(CalibrationError) as caught:
+        calibrate_captures(folder)
     assert str(folder) in str(caught.value)
+    assert said in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_an_unknown_kind_of_board_is_named(folder):
-    write(folder, [FIXED], kind="circles")
-    with pytest.raises(CalibrationError, match=r"board.kind: 'circles' is not one of: charuco, chessboard"):
-        read_index(folder)
-
-
-def test_what_a_killed_run_left_is_no_photo(folder):
-    for name in ("left1.png", "right1.png", ".left7.part.png", ".right1.part.png"):
-        cv2.imwrite(str(folder / name), np.zeros((9, 9, 3), np.uint8))
-    captures, unpaired = pair_photos(folder, "*left*.png", "*right*.png")
+def test_what_a_killed_run_left_is_no_photo(tmp_path):
+    images(tmp_path, dict.fromkeys(("left1.png", "right1.png", ".left7.part.png", ".right1.part.png"), SMALL))
+    captures, unpaired = pair_photos(tmp_path, "*left*.png", "*right*.png")
     assert [capture.source for capture in captures] == ["left1.png", "right1.png"]
     assert not unpaired
 
 
-def test_photos_of_two_sizes_are_refused(folder):
-    for name, size in (
-        ("left1.png", (48, 64)),
-        ("left2.png", (24, 32)),
-        ("right1.png", (9, 9)),
-        ("right2.png", (9, 9)),
-    ):
-        cv2.imwrite(str(folder / name), np.zeros((*size, 3), np.uint8))
-    captures, unpaired = pair_photos(folder, "left*.png", "right*.png")
-    assert not unpaired
-    with pytest.raises(CalibrationError, match=r"left2.png: is 32x24 px where left1.png .* is 64x48"):
-        list(read_images(folder, captures))
+@pytest.mark.parametrize(("names", "left", "said"), [
+    ({}, "left*.png", "left*.png"),
+    ({"left1.png": SMALL, "left01.png": SMALL, "right1.png": SMALL}, "left*.png", "the same number"),
+    ({"left3.png": SMALL, "right2.png": SMALL}, "left*.png", "no two photos"),
+    ({"left.png": SMALL, "right2.png": SMALL}, "left*.png", "left.png"),
+    ({"right2.png": SMALL}, "right*.png", "right2.png matches both"),
+    ({"left1.png": LARGE, "left2.png": SMALL, "right1.png": SMALL, "right2.png": SMALL}, "left*.png",
+     "left2.png: is 32x24 px"),
+])  # fmt: skip
+def test_photos_that_make_no_pairs_are_refused_by_name(tmp_path, names, left, said):
+    images(tmp_path, names)
+    with pytest.raises(CalibrationError) as caught:
+        calibrate_photos(tmp_path, left, "right*.png", BoardConfig())
+    assert said in str(caught.value)
+    with pytest.raises(CalibrationError, match="no such folder"):
+        calibrate_photos(tmp_path / "none", left, "right*.png", BoardConfig())

@@ -12,7 +12,6 @@ from cotarget.board import (
     check_board,
     draw_board,
     marker_dictionary,
-    print_board,
     tiles,
 )
 from cotarget.calibration.corners import find_corners, find_near
@@ -70,18 +69,6 @@ def test_the_drawn_board_is_found_and_numbered_as_opencv_does(square_px):
     np.testing.assert_allclose(corners[numbers.ravel()], theirs.reshape(-1, 2), atol=1.0)
 
 
-def test_the_printed_board_is_read_as_the_board_it_is(tmp_path):
-    board = BoardConfig("charuco", (6, 4), 0.02)
-    print_board(tmp_path / "board.png", board)
-    image = cv2.imread(str(tmp_path / "board.png"))
-    corners = find_corners(image, board)
-    square_px = 0.02 / 0.0254 * 300
-    np.testing.assert_allclose(corners - corners[0], upright(board, square_px, 0), atol=0.2)
-    theirs, numbers, _, _ = cv2.aruco.CharucoDetector(opencv_board(board)).detectBoard(image)
-    assert len(numbers) == 24
-    np.testing.assert_allclose(corners[numbers.ravel()], theirs.reshape(-1, 2), atol=1.0)
-
-
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_numbers_turn_with_the_board(turns):
     image = draw_board(BOARD, 40)
@@ -118,7 +105,7 @@ def test_what_shows_no_board_is_none(image):
 def test_it_may_look_the_same_upside_down_but_not_need_too_many_markers():
     check_board(BOARD)
     check_board(BoardConfig("charuco", (21, 21)))
-    with pytest.raises(ConfigError, match="40x30 needs more than the 250 markers"):
+    with pytest.raises(ConfigError, match=r"board\.corners"):
         check_board(BoardConfig("charuco", (40, 30)))
 
 
@@ -144,6 +131,5 @@ def test_rendered_corners_are_where_they_are():
             errors.append(corners[seen] - truth[seen])
     assert len(errors[-1]) < 48, "the last board reaches out of the image"
     error = np.concatenate(errors)
-    print(f"{len(error)} corners, {np.sqrt(np.mean(error**2)):.3f} px rms, {np.abs(error).max():.2f} at most")
     assert np.sqrt(np.mean(error**2)) < RMS_PX
     assert np.abs(error).max() < WORST_PX

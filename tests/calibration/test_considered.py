@@ -1,46 +1,28 @@
-"""The doubt about parameters that a fit holds: against fits that hold them elsewhere, and against the truth."""
+"""Doubt about parameters that a fit holds: against fits that hold them elsewhere, and against the truth."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from cotarget.board import board_points
-from cotarget.calibration import Options, calibrate_views, predicted_pointing
 from cotarget.calibration.bundle import ALL_BLOCKS, difference, fit, parameter_names
-from cotarget.calibration.initialization import place_boards
 from cotarget.calibration.uncertainty import covariance_of, model_of, with_consider_covariance
-from cotarget.config import BoardConfig
-from experiments.calibration.synthetic.aims import draw_targets, misses
-from experiments.calibration.synthetic.rig import SIZES, Truth
-from experiments.calibration.synthetic.views import Placing, spread_views
+from experiments.calibration.synthetic.rig import Truth
+from tests.support.synthetic_calibration import POINTS, calibrated, drawn, fitted, pointing
 
-BOARD = BoardConfig()
-POINTS = board_points(BOARD)
-PLACING = Placing(boards=10, looks=3)
 SCALES = Truth(pan_scale=1.002, tilt_scale=0.998)
 # A tenth of the scales' error, for a difference of two fits that is linear to a thousandth.
 ELSEWHERE = 0.0002
 
 
-def drawn(truth, seed=0):
-    return spread_views(truth, POINTS, np.random.default_rng((seed, 3)), 0.1, PLACING)
-
-
 @pytest.fixture(scope="module")
-def views():
-    return drawn(SCALES)
-
-
-@pytest.fixture(scope="module")
-def calibration(views):
-    return calibrate_views(views, BOARD, SIZES, options=Options(folds=0))
+def calibration():
+    return calibrated(drawn(SCALES))
 
 
 @pytest.fixture(scope="module")
 def found(calibration):
-    model = place_boards(model_of(calibration), calibration.views, POINTS)
-    return fit(model, calibration.views, POINTS, ALL_BLOCKS)
+    return fitted(model_of(calibration), calibration.views)
 
 
 @pytest.mark.parametrize("name", ["pan_scale", "tilt_scale"])
@@ -74,21 +56,5 @@ def test_scales_that_are_off_are_doubted_by_as_much(calibration):
 
 
 def test_pointing_with_scales_off_is_within_twice_what_is_predicted(calibration):
-    pixels, depths = draw_targets(np.random.default_rng(4), 60)
-    measured = np.sqrt(np.mean(np.square(misses(calibration, SCALES, pixels, depths))))
-    predicted = np.sqrt(np.mean(np.square(predicted_pointing(calibration, pixels, depths))))
+    measured, predicted = pointing(calibration, SCALES)
     assert measured < 2 * predicted
-    own = [not name.endswith("_scale") for name in calibration.covariance.parameters]
-    kept = replace(
-        calibration.covariance,
-        parameters=tuple(np.array(calibration.covariance.parameters)[own]),
-        matrix=calibration.covariance.matrix[np.ix_(own, own)],
-    )
-    without = predicted_pointing(replace(calibration, covariance=kept), pixels, depths)
-    assert np.sqrt(np.mean(np.square(without))) != pytest.approx(predicted, rel=0.05)
-
-
-def test_encoders_that_are_found_are_not_doubted(views):
-    calibration = calibrate_views(views, BOARD, SIZES, options=Options(folds=0, encoders=True))
-    assert calibration.zoom_head.axes.pan_scale == pytest.approx(1.002, abs=0.001)
-    assert calibration.covariance.sigma("head.pan_scale") < 0.001

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -69,12 +70,9 @@ def test_round_trip(tmp_path):
     for name in ("fixed", "pitch_mm", "residuals", "held_out", "board"):
         assert getattr(after, name) == getattr(before, name)
     assert dict(after.provenance) == dict(before.provenance)
-    assert np.allclose(
-        after.zoom_head.T_zoom0_fixed.as_matrix(), before.zoom_head.T_zoom0_fixed.as_matrix(), rtol=0, atol=ROUNDING
-    )
-    assert np.allclose(
-        after.zoom_head.T_head_zoom.as_matrix(), before.zoom_head.T_head_zoom.as_matrix(), rtol=0, atol=ROUNDING
-    )
+    for name in ("T_zoom0_fixed", "T_head_zoom"):
+        one, other = (getattr(calibration.zoom_head, name).as_matrix() for calibration in (after, before))
+        assert np.allclose(one, other, rtol=0, atol=ROUNDING)
     assert dataclasses.astuple(after.zoom_head.axes) == pytest.approx(
         dataclasses.astuple(before.zoom_head.axes), abs=ROUNDING
     )
@@ -83,15 +81,8 @@ def test_round_trip(tmp_path):
     assert (after.covariance.matrix == before.covariance.matrix).all()
     for a, b in zip(after.views, before.views, strict=True):
         assert np.array_equal(a.corners_px, b.corners_px, equal_nan=True)
-        assert replace(a, corners_px=None).name == b.name
-        assert (a.camera, a.board, a.pan, a.tilt, a.focal_px, a.t) == (
-            b.camera,
-            b.board,
-            b.pan,
-            b.tilt,
-            b.focal_px,
-            b.t,
-        )
+        for name in ("camera", "board", "pan", "tilt", "focal_px", "t", "source"):
+            assert getattr(a, name) == getattr(b, name)
     assert list(tmp_path.iterdir()) == [path]  # no temporary file stays
 
 
@@ -120,92 +111,69 @@ def edited(tmp_path, edit):
     return path
 
 
-@pytest.mark.parametrize(("edit", "message"), [
-    (lambda t: t.pop("schema"), "missing key 'schema'"),
-    (lambda t: t.update(schema=99), "schema 99 is not 2"),
-    (lambda t: t.pop("fixed"), "missing key 'fixed'"),
-    (lambda t: t["fixed"].pop("fx"), "fixed: missing key 'fx'; needed here: cx, cy"),
-    (lambda t: t["fixed"].update(fx="wide"), "fixed.fx: 'wide' is not a finite number"),
-    (lambda t: t["fixed"].update(fx=-1), r"fixed.fx: -1 is not within 1 to 1e\+07"),
-    (lambda t: t["fixed"].update(fx=1e8), r"fixed.fx: 1e\+08 is not within 1 to 1e\+07"),
-    (lambda t: t["fixed"].update(cy=-1e308), r"fixed.cy: -1e\+308 is not within -6400 to 6400"),
-    (lambda t: t["zoom"]["stops"][0].update(nominal_px=1e-300), r"stops\[0\].nominal_px: 1e-300 is not within 1 to"),
-    (
-        lambda t: t["zoom"]["stops"][0].update(distortion=[1e308, 0, 0, 0, 0]),
-        r"zoom.stops\[0\].distortion: 1e\+308 is not within -1e\+06 to 1e\+06",
-    ),
-    (lambda t: t["head"].update(pan_scale=3), "head.pan_scale: 3 is not within 0.5 to 2"),
-    (lambda t: t["head"].update(tilt_scale=1e308), r"head.tilt_scale: 1e\+308 is not within 0.5 to 2"),
-    (lambda t: t["fixed"].update(fx=float("nan")), "the number NaN, which is not finite"),
-    (lambda t: t["fixed"].update(size=[640]), "fixed.size: has 1 values where 2 are wanted"),
-    (lambda t: t["zoom"].update(stops=[]), "zoom.stops: is empty"),
-    (lambda t: t["zoom"]["stops"].reverse(), "nominal_px do not increase"),
-    (lambda t: t["zoom"]["stops"][1].update(distortion=[0] * 4), r"zoom.stops\[1\].distortion: has 4 values"),
-    (
-        lambda t: t["T_zoom0_fixed"].update(rotvec_deg=[1e308, 1e308, 3]),
-        r"T_zoom0_fixed.rotvec_deg: \[1e\+308, 1e\+308, 3.0\] is more than a whole turn",
-    ),
-    (lambda t: t.update(T_zoom0_fixed=None), "T_zoom0_fixed: None is not a table"),
+@pytest.mark.parametrize(("edit", "key"), [
+    (lambda t: t.pop("schema"), "schema"),
+    (lambda t: t.update(schema=99), "schema 99"),
+    (lambda t: t.pop("fixed"), "fixed"),
+    (lambda t: t["fixed"].pop("fx"), "fixed: missing key 'fx'"),
+    (lambda t: t["fixed"].update(fx=-1), "fixed.fx"),
+    (lambda t: t["fixed"].update(fx=float("nan")), "NaN"),
+    (lambda t: t["fixed"].update(cy=-1e308), "fixed.cy"),
+    (lambda t: t["fixed"].update(size=[640]), "fixed.size"),
+    (lambda t: t["fixed"].update(k1=0.0), "'fixed.k1'"),
+    (lambda t: t["zoom"].update(stops=[]), "zoom.stops"),
+    (lambda t: t["zoom"]["stops"].reverse(), "nominal_px"),
+    (lambda t: t["zoom"]["stops"][0].update(pupil=0.1), "zoom.stops[0].pupil"),
+    (lambda t: t["zoom"]["stops"][0].update(nominal_px=1e-300), "zoom.stops[0].nominal_px"),
+    (lambda t: t["zoom"]["stops"][1].update(cx=1e308), "zoom.stops[1].cx"),
+    (lambda t: t["zoom"]["stops"][1].update(focal=0.0), "'zoom.stops[1].focal'"),
+    (lambda t: t["zoom"]["stops"][0].update(distortion=[1e308, 0, 0, 0, 0]), "zoom.stops[0].distortion"),
+    (lambda t: t["zoom"]["stops"][1].update(distortion=[0] * 4), "zoom.stops[1].distortion"),
+    (lambda t: t["T_zoom0_fixed"].update(rotvec_deg=[1e308, 1e308, 3]), "T_zoom0_fixed.rotvec_deg"),
+    (lambda t: t.update(T_zoom0_fixed=None), "T_zoom0_fixed"),
     (lambda t: t["T_head_zoom"].pop("rotvec_deg"), "T_head_zoom: missing key 'rotvec_deg'"),
-    (lambda t: t["head"].update(squareness_deg=True), "head.squareness_deg: True is not a finite number"),
-    (lambda t: t["residuals"].update(pairs=1.5), "residuals.pairs: 1.5 is not a whole number"),
-    (lambda t: t["covariance"]["matrix"].pop(), "covariance.matrix: has 1 values where 2 are wanted"),
-    (lambda t: t.update(covariance={"parameters": [], "matrix": []}), "covariance.parameters: is empty"),
-    (lambda t: t["covariance"].update(parameters=["fixed.fx", "zoom[2].pupil"]),
-     r"covariance.parameters: 'zoom\[2\].pupil' is no parameter; they are: fixed.fx, .*, head.tilt_zero"),
-    (lambda t: t["covariance"].update(parameters=["fixed.fx"] * 2), "parameters: 'fixed.fx' is there twice"),
-    (lambda t: t["covariance"].update(matrix=[[1, 0], [0, -2]]),
-     r"covariance.matrix\[1\]\[1\]: -2 is no variance of zoom\[1\].pupil"),
-    (lambda t: t["covariance"].update(matrix=[[0, 1e-9], [1e-9, 1]]), r"matrix\[0\]\[0\]: 0 is no variance"),
-    (lambda t: t["covariance"].update(matrix=[[1, 0.5], [0.4, 1]]), "covariance.matrix: is no covariance: not symm"),
-    (lambda t: t["covariance"].update(matrix=[[1, 1e-9], [2e-9, 1e-17]]), "covariance.matrix: is no covariance"),
-    (lambda t: t["covariance"].update(matrix=[[1, 2], [2, 1]]), "covariance.matrix: is no covariance"),
-    (lambda t: t["covariance"].update(matrix=[[1e-300, 1e99], [1e99, 1e-300]]), "covariance.matrix: is no covariance"),
-    (lambda t: t["head"].update(jitter_deg=-0.01), "head.jitter_deg: -0.01 is negative"),
-    (lambda t: t["held_out"].update(widened=0.5), "held_out.widened: 0.5 is less than 1"),
-    (lambda t: t["held_out"].update(ratio=-1), "held_out.ratio: -1 is negative"),
-    (lambda t: t["held_out"].update(measured_px=-1), "held_out.measured_px: -1 is negative"),
-    (lambda t: t["residuals"].update(fixed_rms_px=-1), "residuals.fixed_rms_px: -1 is negative"),
-    (lambda t: t["residuals"].update(handeye_rms_px=-1), "residuals.handeye_rms_px: -1 is negative"),
-    (lambda t: t["board"].update(square=0), "board.square: 0 is not greater than zero"),
-    (lambda t: t.update(board=None), "board: is null, but there are views"),
-    (lambda t: t["views"][1].update(camera="left"), r"views\[1\].camera: 'left' is not one of: fixed, zoom"),
-    (lambda t: t.update(T_zoom_fixed=1), "unknown key 'T_zoom_fixed'; valid here: T_head_zoom, T_zoom0_fixed, board"),
-    (lambda t: t["fixed"].update(k1=0.0), "unknown key 'fixed.k1'; valid here: cx, cy, distortion, fx, fy, size"),
-    (lambda t: t["zoom"]["stops"][1].update(focal=0.0), r"unknown key 'zoom.stops\[1\].focal'; valid here: cx"),
-    (lambda t: t["T_head_zoom"].update(rotvec=[0] * 3),
-     "unknown key 'T_head_zoom.rotvec'; valid here: rotvec_deg, translation"),
-    (lambda t: t["views"][0].update(pan_deg=1), r"unknown key 'views\[0\].pan_deg'; valid here: board"),
-    (lambda t: t["views"][0]["corners_px"][3].append(1.0), r"views\[0\].corners_px\[3\]: has 3 values where 2 are"),
-    (lambda t: t["views"][0]["corners_px"][3].pop(), r"views\[0\].corners_px\[3\]: has 1 values where 2 are wanted"),
-    (lambda t: t["covariance"]["matrix"][1].append(0.0), r"covariance.matrix\[1\]: has 3 values where 2 are wanted"),
-    (lambda t: t["covariance"]["matrix"][1].insert(0, "a"), r"covariance.matrix\[1\]\[0\]: 'a' is not a finite number"),
-    (lambda t: t["views"][0]["corners_px"].pop(), r"views\[0\].corners_px: has 53 values where 54 are wanted"),
+    (lambda t: t["head"].update(pan_scale=3), "head.pan_scale"),
+    (lambda t: t["head"].update(squareness_deg=True), "head.squareness_deg"),
+    (lambda t: t["head"].update(jitter_deg=-0.01), "head.jitter_deg"),
+    (lambda t: t["residuals"].update(pairs=1.5), "residuals.pairs"),
+    (lambda t: t["residuals"].update(handeye_rms_px=-1), "residuals.handeye_rms_px"),
+    (lambda t: t.update(covariance={"parameters": [], "matrix": []}), "covariance.parameters"),
+    (lambda t: t["covariance"].update(parameters=["fixed.fx", "zoom[2].pupil"]), "'zoom[2].pupil'"),
+    (lambda t: t["covariance"].update(parameters=["fixed.fx"] * 2), "covariance.parameters: 'fixed.fx'"),
+    (lambda t: t["covariance"]["matrix"].pop(), "covariance.matrix"),
+    (lambda t: t["covariance"]["matrix"][1].append(0.0), "covariance.matrix[1]"),
+    (lambda t: t["covariance"].update(matrix=[[1, 0], [0, -2]]), "covariance.matrix[1][1]"),
+    (lambda t: t["covariance"].update(matrix=[[0, 1e-9], [1e-9, 1]]), "covariance.matrix[0][0]"),
+    (lambda t: t["covariance"].update(matrix=[[1, 0.5], [0.4, 1]]), "covariance.matrix"),
+    (lambda t: t["covariance"].update(matrix=[[1, 2], [2, 1]]), "covariance.matrix"),
+    (lambda t: t["covariance"].update(matrix=[[1e-300, 1e99], [1e99, 1e-300]]), "covariance.matrix"),
+    (lambda t: t["held_out"].update(widened=0.5), "held_out.widened"),
+    (lambda t: t["board"].update(square=0), "board.square"),
+    (lambda t: t.update(board=None), "board"),
+    (lambda t: t["views"][1].update(camera="left"), "views[1].camera"),
+    (lambda t: t["views"][0]["corners_px"][3].pop(), "views[0].corners_px[3]"),
+    (lambda t: t["views"][0]["corners_px"].pop(), "views[0].corners_px"),
 ])  # fmt: skip
-def test_errors_name_the_file_and_the_key_in_one_line(tmp_path, edit, message):
+def test_errors_name_the_file_and_the_key_in_one_line(tmp_path, edit, key):
     path = edited(tmp_path, edit)
-    with pytest.raises(CalibrationError, match=message) as caught:
+    with pytest.raises(CalibrationError, match=re.escape(key)) as caught:
         load_calibration(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("content", "message"), [
-    (b"", "is empty; give a calibration.json, as cotarget calibrate writes it"),
-    (b"[1]", "holds no JSON object; give a"), (b"\xff\xfe", "not UTF-8"),
-    (b'{"schema": 2, "fi', "is not JSON: .*; give a"),
-    (b'backend = "sim"\n[sim]\nseed = 1\n', "is TOML; give a calibration.json"),
-    (b'{"schema": 1e999}', "is no calibration; give a"),
+@pytest.mark.parametrize(("content", "what"), [
+    (b"", "empty"), (b"[1]", "no JSON object"), (b"\xff\xfe", "UTF-8"), (b'{"schema": 2, "fi', "not JSON"),
+    (b'backend = "sim"\n[sim]\nseed = 1\n', "TOML"),
+    (b'{"schema": 1e999}', "no calibration"),
     (b'{"schema": 1e999, "fixed": 1}', "schema inf"),
-    (b'{"schema": 1, "board": {}, "pitch_mm": null, "captures": []}',
-     "is no calibration, but the index of captures: cotarget calibrate --from its folder makes one of them; give a"),
-    (b'{"schema": 1, "versions": {}, "config": null}',
-     "is no calibration, but what a capture session or a recording says of itself; give a calibration.json"),
+    (b'{"schema": 1, "board": {}, "pitch_mm": null, "captures": []}', "captures"),
+    (b'{"schema": 1, "versions": {}, "config": null}', "session"),
 ])  # fmt: skip
-def test_what_is_no_calibration_at_all(tmp_path, content, message):
+def test_what_is_no_calibration_at_all(tmp_path, content, what):
     path = tmp_path / "c.json"
     path.write_bytes(content)
-    with pytest.raises(CalibrationError, match=message):
+    with pytest.raises(CalibrationError, match=what):
         load_calibration(path)
 
 

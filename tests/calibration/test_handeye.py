@@ -13,45 +13,36 @@ from experiments.calibration.synthetic.rig import Truth
 EXACT = 1e-10  # m and rad: noise-free motions leave only rounding
 
 
-def exact_motions(hand, angles, truth=None):
-    """Motions of a head with crossing or real axes, and of a camera that watches one board."""
-    truth = truth or Truth(hand=hand, dz=0.0, eps=0.0)
+def exact_motions(hand, angles, dz=0.0):
+    """Motions of a head, and of a camera that watches one board."""
+    truth = Truth(hand=hand, dz=dz, eps=0.0)
     heads = [RigidTransform.from_matrix(truth.base_head(pan, tilt)) for pan, tilt in angles]
     board = pose([0.3, -0.2, 4.0], [10.0, 20.0, 30.0])  # in the base's frame
     return motions(heads, [hand.inv() * head.inv() * board for head in heads])
 
 
+@pytest.mark.parametrize("dz", [0.0, 0.2], ids=["axes that cross", "an offset, so that the head shifts as it turns"])
 @pytest.mark.parametrize("angles", [
     [(0.0, 0.0), (0.2, 0.0), (0.0, 0.2)],
     [(0.1, -0.3), (0.4, 0.2), (-0.5, 0.1), (0.3, 0.3)],
 ])  # fmt: skip
-def test_exact_motions_give_t_exactly(angles):
+def test_exact_motions_give_t_exactly(angles, dz):
     rng = np.random.default_rng(1)
     for _ in range(20):
         hand = pose(rng.uniform(-0.3, 0.3, 3), rng.uniform(-90, 90, 3))
-        A, B = exact_motions(hand, angles)
-        error = park_martin(A, B).inv() * hand
+        error = park_martin(*exact_motions(hand, angles, dz)).inv() * hand
         assert error.rotation.magnitude() < EXACT
         assert np.linalg.norm(error.translation) < EXACT
 
 
-def test_motions_with_a_shift_give_t_exactly_too():
-    """A head with an axis offset of 0.2 m shifts as it turns; so does a robot's arm."""
-    hand = pose([0.1, -0.2, 0.05], [10.0, -20.0, 30.0])
-    A, B = exact_motions(hand, [(0.1, -0.3), (0.4, 0.2), (-0.5, 0.1)], Truth(hand=hand, dz=0.2))
-    error = park_martin(A, B).inv() * hand
-    assert error.rotation.magnitude() < EXACT
-    assert np.linalg.norm(error.translation) < EXACT
-
-
 def test_matrices_are_refused_in_words():
-    with pytest.raises(CalibrationError, match=r"RigidTransform\.from_matrix makes them"):
+    with pytest.raises(CalibrationError, match="RigidTransform"):
         solve_hand_eye([np.eye(4)] * 3, [np.eye(4)] * 3)
 
 
 @pytest.mark.parametrize(("angles", "message"), [
-    ([(0.0, 0.1), (0.2, 0.1), (-0.3, 0.1)], "only pan moved.*along the pan axis.*add tilt"),
-    ([(0.1, 0.0), (0.1, 0.2), (0.1, -0.3)], "only tilt moved.*along the tilt axis.*add pan"),
+    ([(0.0, 0.1), (0.2, 0.1), (-0.3, 0.1)], "only pan moved"),
+    ([(0.1, 0.0), (0.1, 0.2), (0.1, -0.3)], "only tilt moved"),
     ([(0.1, 0.1), (0.1, 0.1)], "did not move"),
 ])  # fmt: skip
 def test_motions_about_one_axis_are_refused_in_words(angles, message):
@@ -70,24 +61,19 @@ def test_a_head_that_counts_the_other_way_is_the_same_head_turned_round():
     assert (park_martin(A, B).inv() * turned).rotation.magnitude() < EXACT
 
 
-def test_motions_the_wrong_way_round_are_a_reflection():
-    A, B = exact_motions(HAND, ANGLES)
-    with pytest.raises(CalibrationError, match="determinant -1"):
-        park_martin(A, [b.inv() for b in B])
+WIDE_ANGLES = [(0.0, 0.0), (0.9, 0.3), (-0.8, 0.5), (0.7, -0.6), (-0.9, -0.2)]
 
 
-def test_exchanged_pan_and_tilt_are_noticed():
-    angles = [(0.0, 0.0), (0.9, 0.3), (-0.8, 0.5), (0.7, -0.6), (-0.9, -0.2)]
-    _, B = exact_motions(HAND, angles)
-    A, _ = exact_motions(HAND, [(tilt, pan) for pan, tilt in angles])
-    with pytest.raises(CalibrationError, match="pan and tilt are not exchanged"):
-        park_martin(A, B)
-
-
-def test_a_camera_that_does_not_turn_with_the_head_is_noticed():
-    A, _ = exact_motions(HAND, ANGLES)
-    with pytest.raises(CalibrationError, match=r"turned by 0\.0"):
-        park_martin(A, [RigidTransform.identity()] * len(A))
+@pytest.mark.parametrize(("A", "B", "said"), [
+    (exact_motions(HAND, ANGLES)[0], [b.inv() for b in exact_motions(HAND, ANGLES)[1]], "reflection"),
+    (exact_motions(HAND, [(tilt, pan) for pan, tilt in WIDE_ANGLES])[0], exact_motions(HAND, WIDE_ANGLES)[1],
+     "exchanged"),
+    (exact_motions(HAND, ANGLES)[0], [RigidTransform.identity()] * 10, "units"),
+], ids=["the wrong way round", "pan and tilt exchanged", "a camera that does not turn"])  # fmt: skip
+@pytest.mark.parametrize("solve", [park_martin, solve_hand_eye_from_motions])
+def test_contradictions_are_refused(solve, A, B, said):
+    with pytest.raises(CalibrationError, match=said):
+        solve(A, B)
 
 
 X = pose([0.05, -0.08, 0.1], [20.0, -30.0, 70.0])
@@ -291,25 +277,17 @@ PLANAR = [
 ]
 SHIFTED = [pose(t, [0.0, 0.0, 10.0]) for t in np.random.default_rng(9).uniform(-0.4, 0.4, (12, 3))]
 SKEW = [RigidTransform.from_rotation(Rotation.from_rotvec(np.array([0, 1, 1]) * turn)) for turn in (0, 0.1, 0.2, -0.3)]
+ABOUT_PAN = ("position along the pan axis", "rotation about the pan axis")
+ABOUT_TILT = ("position along the tilt axis", "rotation about the tilt axis")
+# Poses of the hand, what they leave free, and the directions of that: turns and shifts.
 UNDETERMINED = {
-    "pan": (head([(-15, 0), (-5, 0), (0, 0), (10, 0)]),
-            "only pan moved: the camera's position along the pan axis and rotation about the pan axis are free; "
-            "add tilt",
-            [[0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0]]),
-    "tilt": (head([(5, -15), (5, -5), (5, 0), (5, 10)]),
-             "only tilt moved: the camera's position along the tilt axis and rotation about the tilt axis are free; "
-             "add pan",
-             [[1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0]]),
-    "skew": (SKEW, "all motions turn about one axis, (0.00, 0.71, 0.71) in the hand's frame: the camera's position "
-                   "along that axis and rotation about that axis are free; turn the hand about a second axis",
-             [[0, 1, 1, 0, 0, 0], [0, 0, 0, 0, 1, 1]]),
-    "planar": (PLANAR, "all motions turn about one axis, (0.00, 0.00, 1.00) in the hand's frame: the camera's position "
-                       "along that axis is free; turn the hand about a second axis", [[0, 0, 0, 0, 0, 1]]),
-    "shifted": (SHIFTED, "the hand shifted but did not turn: the camera's position is free; turn it about two axes",
-                [[0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]]),
-    "still": ([SHIFTED[0]] * 5, "the hand did not move between the views: the camera's position and rotation are free; "
-                                "turn it about two axes (pan and tilt)", np.eye(6)),
-}  # fmt: skip
+    "pan": (head([(-15, 0), (-5, 0), (0, 0), (10, 0)]), ABOUT_PAN, [[0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0]]),
+    "tilt": (head([(5, -15), (5, -5), (5, 0), (5, 10)]), ABOUT_TILT, [[1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0]]),
+    "skew": (SKEW, ("position along that axis", "rotation about that axis"), [[0, 1, 1, 0, 0, 0], [0, 0, 0, 0, 1, 1]]),
+    "planar": (PLANAR, ("position along that axis",), [[0, 0, 0, 0, 0, 1]]),
+    "shifted": (SHIFTED, ("position",), [[0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]]),
+    "still": ([SHIFTED[0]] * 5, ("position", "rotation"), np.eye(6)),
+}
 INSISTED_SIGMA = 1.0  # rad or m
 ALONG = 0.02  # how far directions found with noise may lean
 
@@ -317,18 +295,17 @@ ALONG = 0.02  # how far directions found with noise may lean
 @pytest.mark.parametrize("case", UNDETERMINED)
 @pytest.mark.parametrize("from_poses", [True, False])
 def test_what_is_free_is_said_and_stays_uncertain(case, from_poses):
-    hands, text, free = UNDETERMINED[case]
+    hands, names, free = UNDETERMINED[case]
     rng = np.random.default_rng(10)
     seen = [noisy(T, rng, 1e-3, 1e-3) for T in boards_seen(hands)]
     solve, given = (
         (solve_hand_eye, (hands, seen)) if from_poses else (solve_hand_eye_from_motions, motions(hands, seen))
     )
-    with pytest.raises(CalibrationError) as refused:
+    with pytest.raises(CalibrationError, match=f"camera's {names[0]}"):
         solve(*given)
-    assert str(refused.value) == f"hand-eye: {text}"
     found = solve(*given, regularize=True)
     assert not found.verdict.determined
-    assert found.verdict.text == text
+    assert found.verdict.free == names
     assert found.verdict.directions.shape == (len(free), 6)
     # A turn about an axis that does not pass through the hand's origin shifts it as well, so look at what stays put.
     free = np.array(free, dtype=float).T
@@ -358,7 +335,7 @@ def test_motions_too_small_for_their_noise():
     rng = np.random.default_rng(11)
     hands = head(rng.uniform(-0.6, 0.6, (10, 2)))
     seen = [noisy(T, rng) for T in boards_seen(hands)]
-    with pytest.raises(CalibrationError, match=r"motions of 1\.\d degrees at most, .* are too small for their noise"):
+    with pytest.raises(CalibrationError, match="too small for their noise"):
         solve_hand_eye(hands, seen)
 
 
@@ -377,14 +354,9 @@ def test_pan_at_another_tilt_is_pan():
         solve_hand_eye(hands, boards_seen(hands))
 
 
-def test_contradictions_are_refused_here_too():
-    A, B = motions(arm(np.random.default_rng(13), 6), boards_seen(arm(np.random.default_rng(13), 6)))
-    with pytest.raises(CalibrationError, match="determinant -1"):
-        solve_hand_eye_from_motions(A, [b.inv() for b in B])
-    with pytest.raises(CalibrationError, match="units"):
-        solve_hand_eye_from_motions(A, [RigidTransform.identity()] * len(A), regularize=True)
+def test_too_few_views_are_refused():
     with pytest.raises(CalibrationError, match="1 and 1 motions"):
-        solve_hand_eye_from_motions(A[:1], B[:1])
+        solve_hand_eye_from_motions([X], [X])
     with pytest.raises(CalibrationError, match="three views"):
         solve_hand_eye([X, X], [X, X])
     with pytest.raises(CalibrationError, match="as many poses"):

@@ -5,47 +5,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cotarget.board import board_points
-from cotarget.calibration import Options, calibrate_views, predicted_pointing
-from cotarget.config import BoardConfig
+from cotarget.calibration import predicted_pointing
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform, Rotation
 from experiments.calibration.honesty import error_of
-from experiments.calibration.synthetic.aims import aim, draw_targets, misses
-from experiments.calibration.synthetic.rig import SIZES, Truth, other_rig
-from experiments.calibration.synthetic.views import Placing, spread_views, synthetic_views
+from experiments.calibration.synthetic.aims import aim, draw_targets
+from experiments.calibration.synthetic.rig import Truth, other_rig
+from experiments.calibration.synthetic.views import synthetic_views
+from tests.support.synthetic_calibration import (
+    BOARD,
+    POINTING_FACTOR,
+    POINTS,
+    TARGETS,
+    calibrated,
+    drawn,
+    pointing,
+    rms,
+)
 
-BOARD = BoardConfig()
-POINTS = board_points(BOARD)
 COLUMNS, ROWS = BOARD.corners
-NOISE_PX = 0.1
-PLACING = Placing(boards=10, looks=3)
-QUICK = Options(folds=0)
-TARGETS = 40
 # The solver stops when the cost, some 4000 squares of one standard deviation each, falls by less than 1e-10 of itself:
 # 4e-7, and a parameter is then off by the root of that, in standard deviations.
 SAME_SIGMAS = 1e-3
 PULL = 5.0  # standard deviations that none of thirty parameters exceeds but once in fifty thousand times
-# One calibration's pointing error is one draw of the few directions of the parameters that matter.
-POINTING_FACTOR = 3.0
-
-
-def drawn(truth, seed, placing=PLACING):
-    return spread_views(truth, POINTS, np.random.default_rng((seed, 3)), NOISE_PX, placing)
-
-
-def calibrated(views, **options):
-    return calibrate_views(views, BOARD, SIZES, options=replace(QUICK, **options))
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def pointing(calibration, truth, seed=4, rng=None):
-    """Measured and predicted rms pointing error on the same targets [rad]."""
-    targets = draw_targets(np.random.default_rng(seed), TARGETS)
-    return rms(misses(calibration, truth, *targets, rng)), rms(predicted_pointing(calibration, *targets))
 
 
 def largest_pull(calibration, truth):
@@ -136,7 +118,7 @@ def test_a_jittery_head_is_noticed_and_its_pointing_predicted():
     truth = replace(Truth(), jitter=JITTER)
     jitters, with_head, without = [], [], []
     for seed in range(SEEDS):
-        found = calibrated(drawn(truth, seed, Placing(boards=6, looks=4)))
+        found = calibrated(drawn(truth, seed, boards=6, looks=4))
         jitters.append(found.jitter)
         without.append(pointing(replace(found, jitter=0.0), Truth(), seed))
         if seed < AIM_SEEDS:
@@ -161,7 +143,7 @@ SUPPOSED = 0.002
 
 def test_the_encoders_scales_are_found():
     truth = replace(Truth(), pan_scale=SCALES[0], tilt_scale=SCALES[1])
-    found = calibrated(drawn(truth, 0, Placing(boards=12, looks=4)), encoders=True)
+    found = calibrated(drawn(truth, 0, boards=12, looks=4), encoders=True)
     assert {"head.pan_scale", "head.tilt_scale", "head.pan_zero", "head.tilt_zero"} < set(found.covariance.parameters)
     for name, true in zip(("pan_scale", "tilt_scale"), SCALES, strict=True):
         sigma = found.covariance.sigma(f"head.{name}")
@@ -181,7 +163,7 @@ def test_cameras_far_apart_that_never_share_a_view_at_home(side):
     turn = Rotation.from_euler("z", 90, degrees=True) * Rotation.from_euler("y", side * APART, degrees=True)
     gamma = RigidTransform.from_components(-turn.apply([side * BASELINE, 0.0, 0.0]), turn)
     truth = replace(Truth(), gamma=gamma)
-    views = [v for v in drawn(truth, 0, Placing(boards=12, looks=4)) if v.camera == "fixed" or v.pan or v.tilt]
+    views = [v for v in drawn(truth, 0, boards=12, looks=4) if v.camera == "fixed" or v.pan or v.tilt]
     found = calibrated(views)
     assert found.residuals.pairs == 0
     assert largest_pull(found, truth) < PULL

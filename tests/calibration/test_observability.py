@@ -93,22 +93,22 @@ def hand_normal(angles):
     return without_boards(*zip(*parts, strict=True))
 
 
-@pytest.mark.parametrize(("angles", "expected"), [
-    ([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.0)],
-     "only pan moved: T_head_zoom's position along the pan axis, T_head_zoom's rotation about the pan axis, "
-     "the head's axis offset and the head's squareness are free; add tilt"),
-    ([(0.0, 0.0), (0.0, 0.2), (0.0, -0.1)],
-     "only tilt moved: T_head_zoom's position along the tilt axis, T_head_zoom's rotation about the tilt axis, "
-     "the head's axis offset and the head's squareness are free; add pan"),
-    ([(0.0, 0.0)], "T_head_zoom's position, T_head_zoom's rotation, the head's axis offset"),
-    ([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.1), (0.1, 0.25)], ""),
+OF_HEAD = ("axis offset", "squareness")
+
+
+@pytest.mark.parametrize(("angles", "begins", "free"), [
+    ([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.0)], "only pan moved",
+     ("position along the pan axis", "rotation about the pan axis", *OF_HEAD, "add tilt")),
+    ([(0.0, 0.0), (0.0, 0.2), (0.0, -0.1)], "only tilt moved",
+     ("position along the tilt axis", "rotation about the tilt axis", *OF_HEAD, "add pan")),
+    ([(0.0, 0.0)], "T_head_zoom's position, T_head_zoom's rotation", OF_HEAD),
+    ([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.1), (0.1, 0.25)], "", ()),
 ])  # fmt: skip
-def test_a_head_that_moves_too_little(angles, expected):
-    normal = hand_normal(angles)
-    weak = weak_directions(normal, HAND_NAMES, SIGMA_PX**2)
-    text = name_directions(HAND_NAMES, weak)
-    assert text.startswith(expected)
-    assert bool(text) == bool(expected)
+def test_a_head_that_moves_too_little(angles, begins, free):
+    text = name_directions(HAND_NAMES, weak_directions(hand_normal(angles), HAND_NAMES, SIGMA_PX**2))
+    assert text.startswith(begins)
+    assert all(words in text for words in free)
+    assert bool(text) == bool(begins)
 
 
 def test_directions_are_the_null_space_whatever_spans_it():
@@ -129,19 +129,18 @@ def test_the_limit_is_five_degrees(sigma, weak):
     assert len(weak_directions(normal, names, 1.0)) == weak
 
 
-@pytest.mark.parametrize(("name", "text"), [
-    ("T_zoom0_fixed.tz",
-     "T_zoom0_fixed's position is free; show both cameras the same placements, near and far"),
-    ("zoom[2].pupil", "the zoom camera's stop 2's pupil's shift is free; "
-                      "show boards near and far at that focal length"),
-    ("zoom.k1", "the zoom camera's distortion is free; show boards out to the image's corners"),
-    ("head.pan_scale", "the head's scale of pan is free; add pan"),
-    ("T_head_zoom.tz", "T_head_zoom's position is free; move both pan and tilt further, with boards nearer"),
+@pytest.mark.parametrize(("name", "free", "add"), [
+    ("T_zoom0_fixed.tz", "T_zoom0_fixed's position", "near and far"),
+    ("zoom[2].pupil", "the zoom camera's stop 2's pupil's shift", "near and far at that focal length"),
+    ("zoom.k1", "the zoom camera's distortion", "corners"),
+    ("head.pan_scale", "the head's scale of pan", "add pan"),
+    ("T_head_zoom.tz", "T_head_zoom's position", "nearer"),
 ])  # fmt: skip
-def test_one_parameter_alone(name, text):
+def test_one_parameter_alone(name, free, add):
     names = ["fixed.fx", name]
-    weak = weak_directions(np.diag([1.0, 0.0]), names, 0.0)
-    assert name_directions(names, weak) == text
+    text = name_directions(names, weak_directions(np.diag([1.0, 0.0]), names, 0.0))
+    assert text.startswith(f"{free} is free; ")
+    assert add in text
 
 
 def test_nothing_weak_and_names_nobody_knows():

@@ -90,7 +90,6 @@ def test_corners_in_view_are_found_and_numbered(views, how):
         assert not seen[~inside(truth, 0)].any()
         errors.append(corners[seen] - truth[seen])
     error = np.concatenate(errors)
-    print(f"{len(error)} corners, {np.sqrt(np.mean(error**2)):.3f} px rms, {np.abs(error).max():.2f} at most")
     assert np.sqrt(np.mean(error**2)) < RMS_PX
     assert np.abs(error).max() < WORST_PX
 

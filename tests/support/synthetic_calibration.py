@@ -1,0 +1,45 @@
+"""Views, fits and calibrations of synthetic rigs with the default board."""
+
+import numpy as np
+
+from cotarget.board import board_points
+from cotarget.calibration import Options, calibrate_views, predicted_pointing
+from cotarget.calibration.bundle import ALL_BLOCKS, fit
+from cotarget.calibration.initialization import place_boards
+from cotarget.config import BoardConfig
+from experiments.calibration.synthetic.aims import draw_targets, misses
+from experiments.calibration.synthetic.rig import SIZES
+from experiments.calibration.synthetic.views import Placing, spread_views
+
+BOARD = BoardConfig()
+POINTS = board_points(BOARD)
+NOISE_PX = 0.1
+TARGETS = 40
+# One calibration's pointing error is one draw of the few directions of the parameters that matter.
+POINTING_FACTOR = 3.0
+
+
+def drawn(truth, seed=0, boards=10, looks=3, noise_px=NOISE_PX):
+    """Views of placements all over both images."""
+    placing = Placing(boards=boards, looks=looks)
+    return spread_views(truth, POINTS, np.random.default_rng((seed, 3)), noise_px, placing)
+
+
+def calibrated(views, method="joint", folds=0, **options):
+    """The calibration from views; without a held-out check, to be quick."""
+    return calibrate_views(views, BOARD, SIZES, options=Options(method, folds=folds, **options))
+
+
+def fitted(start, views, prior=None):
+    """The fit of all usual parameters at one focal length."""
+    return fit(place_boards(start, views, POINTS), views, POINTS, ALL_BLOCKS, prior=prior)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def pointing(calibration, truth, seed=4, rng=None):
+    """Measured and predicted rms pointing error on the same targets [rad]."""
+    targets = draw_targets(np.random.default_rng(seed), TARGETS)
+    return rms(misses(calibration, truth, *targets, rng)), rms(predicted_pointing(calibration, *targets))
