@@ -46,11 +46,24 @@ def check(config: "RigConfig") -> None:
     check_hardware(config.hardware)
     if config.backend == "replay":
         _recording_of(config)
-    if config.backend != "replay" and config.safety.watchdog_s * (rate_hz := _described(config).fixed.rate_hz) <= 1:
+    else:
+        _check_times(config)
+
+
+def _check_times(config: "RigConfig") -> None:
+    """Refuse times of the safety layer that would end every run."""
+    spec, safety = _described(config), config.safety
+    if safety.watchdog_s * spec.fixed.rate_hz <= 1:
         raise ConfigError(
-            f"safety.watchdog_s: {config.safety.watchdog_s:g} s would halt the head between any two frames of the "
-            f"fixed camera, of which {rate_hz:g} come a second"
+            f"safety.watchdog_s: {safety.watchdog_s:g} s would halt the head between any two frames of the fixed "
+            f"camera, of which {spec.fixed.rate_hz:g} come a second"
         )
+    for name, camera in (("fixed", spec.fixed), ("zoom", spec.zoom)):
+        if camera.latency_s >= safety.max_frame_age_s:
+            raise ConfigError(
+                f"{config.backend}.{name}.latency_s: {camera.latency_s:g} s makes every frame older than "
+                f"safety.max_frame_age_s, {safety.max_frame_age_s:g} s"
+            )
 
 
 def open_rig(config: "RigConfig | Path | str", guarded: bool = True) -> Rig:

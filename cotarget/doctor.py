@@ -127,8 +127,9 @@ def _serial_ports() -> Finding:
 
     try:
         found = [f"{device} ({description})" for device, description in ports()]
-    except CotargetError as error:
-        return Finding("serial ports", False, str(error), "pip install --force-reinstall pyserial")
+    except ImportError as error:
+        text = f"pyserial cannot be imported: {error}"
+        return Finding("serial ports", False, text, "pip install --force-reinstall pyserial")
     return Finding("serial ports", True, ", ".join(found) or "none (none is needed for the simulation)")
 
 

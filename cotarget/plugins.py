@@ -161,10 +161,10 @@ class Reporting:
     Args:
         device: the device.
         what: its table in rig.toml, for messages.
-        answers: what its methods have to return, by name.
+        answers: what its methods have to return, by name; None for nothing.
     """
 
-    def __init__(self, device: Any, what: str, answers: Mapping[str, Answer]) -> None:
+    def __init__(self, device: Any, what: str, answers: Mapping[str, Answer | None]) -> None:
         self._device, self._what, self._answers = device, what, answers
 
     def __getattr__(self, name: str) -> Any:

@@ -176,13 +176,13 @@ def denied(*_, **__):
     raise serial.SerialException(13, "could not open port")
 
 
-def uncalibrated(port, baud):
-    raise UncalibratedError(f"the pan-tilt unit at {port} is not calibrated")
+def uncalibrated(settings):
+    raise UncalibratedError(f"the pan-tilt unit at {settings.port} is not calibrated")
 
 
 @pytest.mark.parametrize(("replaced", "by", "fix"), [
     ("serial.serial_for_url", denied, "dialout"),
-    ("cotarget.drivers.ptu_d46.probe", uncalibrated, "cotarget reset-head --rig rig.toml"),
+    ("cotarget.drivers.ptu_d46.D46Head.probe", uncalibrated, "cotarget reset-head --rig rig.toml"),
 ])  # fmt: skip
 def test_a_head_that_does_not_answer_as_it_should_is_told_with_what_helps(tried, monkeypatch, replaced, by, fix):
     monkeypatch.setattr(replaced, by)

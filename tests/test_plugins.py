@@ -185,7 +185,7 @@ def test_an_own_detector_is_found_beside_rig_toml(rig, monkeypatch):
     detector = make_detector(load_config(rig).target("wall"), 25.0)
     [found] = detector.detect(Frame(np.full((48, 64, 3), 9, np.uint8), 0.0))
     assert found.size_px.tolist() == [4.0, 5.0]
-    with pytest.raises(CotargetError, match=r"^the detector: .*devices\.py:\d+: KeyError: 'dark'$"):
+    with pytest.raises(CotargetError, match=r"^detector '.*devices\.py:boxes': .*devices\.py:\d+: KeyError: 'dark'$"):
         detector.detect(Frame(np.zeros((48, 64, 3), np.uint8), 0.0))
 
 

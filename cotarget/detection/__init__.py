@@ -47,7 +47,8 @@ def make_detector(target: TargetProfile, rate_hz: float, template: Image | None 
     """
     kind = target.detector
     if is_own(kind):
-        return ExternalDetector(reporting(load(kind, f"detector '{kind}'"), "the detector"))
+        where = f"detector '{kind}'"
+        return ExternalDetector(reporting(load(kind, where), where))
     if kind == "speck":
         return SmallTargetDetector()
     if kind in ("motion", "mog2"):

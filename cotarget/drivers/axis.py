@@ -19,7 +19,7 @@ from urllib.parse import unquote, urlsplit
 
 from annotated_types import Gt, Interval
 
-from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, FrameCounts, RefusedError
+from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, FrameCounts, StreamRefusedError
 from cotarget.drivers.mjpeg import MultipartReader, boundary_of, import_simplejpeg
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError
 from cotarget.rig import CameraSpec, Clock, Frame
@@ -81,7 +81,7 @@ class AxisSettings:
         return CameraSpec(self.size, self.rate_hz, self.latency_s)
 
 
-class LoginError(RefusedError):
+class LoginError(StreamRefusedError):
     """The server refuses the user or the password."""
 
 
@@ -120,29 +120,21 @@ class VideoServer:
 
     Attributes:
         name: the server's name in messages.
+        web: its HTTP interface, to be closed.
         silence_s: a stream has stalled after this time without a byte [s].
 
     Raises:
-        ConfigError: the config has no usable address.
+        ConfigError: the address is invalid.
         DeviceError: httpx is missing.
     """
 
     def __init__(self, config: AxisSettings) -> None:
-        self._config = config
-        self.name, self._user, self._password = _access(config)
+        self._config, parts = config, urlsplit(config.url)
+        self._user = config.user or unquote(parts.username or "")
+        self._password = config.password or unquote(parts.password or "") or os.environ.get(PASSWORD_VARIABLE, "")
+        self.name = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}".rstrip("/")
         self.silence_s = max(SILENCE_S, SILENCE_PICTURES / config.rate_hz)
-        try:
-            self._web = WebDevice(self.name, self._user, self._password, self.silence_s)
-        except ConfigError as error:
-            raise ConfigError(f"hardware.fixed.url: {error}") from None
-
-    def end(self) -> None:
-        """Break off a request that another thread reads, and refuse further requests."""
-        self._web.end()
-
-    def close(self) -> None:
-        """Release the HTTP client."""
-        self._web.close()
+        self.web = WebDevice(self.name, self._user, self._password, self.silence_s)
 
     def identify(self) -> Identity | None:
         """Ask the server for its brand, product, firmware and inputs.
@@ -154,18 +146,18 @@ class VideoServer:
             DeviceError: the server cannot be reached.
         """
         for path in PARAMETER_PATHS:
-            told = self._parameters(path, "root.Brand")
-            if told is None:
+            listed = self._parameters(path, "root.Brand")
+            if listed is None:
                 return None  # repeated wrong passwords may lock the user out
-            if told:
+            if listed:
                 for group in ("root.Properties", "root.ImageSource"):
-                    told |= self._parameters(path, group) or {}
-                inputs = told.get("ImageSource.NbrOfSources", "")
+                    listed |= self._parameters(path, group) or {}
+                inputs = listed.get("ImageSource.NbrOfSources", "")
                 return Identity(
-                    brand=told.get("Brand.Brand", ""),
-                    product=told.get("Brand.ProdNbr", ""),
-                    firmware=told.get("Properties.Firmware.Version", ""),
-                    api=told.get("Properties.API.HTTP.Version", ""),
+                    brand=listed.get("Brand.Brand", ""),
+                    product=listed.get("Brand.ProdNbr", ""),
+                    firmware=listed.get("Properties.Firmware.Version", ""),
+                    api=listed.get("Properties.API.HTTP.Version", ""),
                     inputs=int(inputs) if re.fullmatch("[0-9]{1,4}", inputs) else None,
                 )
         return None
@@ -177,7 +169,7 @@ class VideoServer:
             DeviceError: the server cannot be reached.
         """
         camera = self._config.camera
-        text = self._web.text(STATUS_PATH, {"status": str(camera)}) or ""
+        text = self.web.text(STATUS_PATH, {"status": str(camera)}) or ""
         match = re.search(rf"^\s*Video\s+{camera}\s*=\s*(no\s+)?video\b", text, re.IGNORECASE | re.MULTILINE)
         return None if match is None else match[1] is None
 
@@ -203,19 +195,19 @@ class VideoServer:
         """Describe the server in one line.
 
         Raises:
-            RefusedError: the server reports nothing about itself and has no stream either; the message says why.
+            StreamRefusedError: the server reports nothing about itself and has no stream either; the message says why.
             DeviceError: the server cannot be reached.
         """
         identity, video = self.identify(), self.has_video()
         if identity is None and video is None:
             with self.stream():
-                return "tells nothing of itself, but sends pictures"
-        told = [] if identity is None else [f"{identity.brand} {identity.product}".strip()]
+                return "does not say what it is, but sends pictures"
+        parts = [] if identity is None else [f"{identity.brand} {identity.product}".strip()]
         if identity is not None and identity.firmware:
-            told.append(f"firmware {identity.firmware}")
+            parts.append(f"firmware {identity.firmware}")
         if video:
-            told.append(f"input {self._config.camera} has video")
-        return ", ".join(told)
+            parts.append(f"input {self._config.camera} has video")
+        return ", ".join(parts)
 
     @contextlib.contextmanager
     def stream(self, api: str = "") -> Iterator[Stream]:
@@ -226,7 +218,7 @@ class VideoServer:
 
         Raises:
             BusyError: the server has no place for another viewer now.
-            RefusedError: the server has no such stream for this user.
+            StreamRefusedError: the server has no such stream for this user.
             DeviceError: the server cannot be reached, or the stream breaks off; also while it is read.
         """
         config = self._config
@@ -236,20 +228,20 @@ class VideoServer:
             query["resolution"] = config.resolution
         if api.startswith("2"):
             query["des_fps"] = rate  # the name of fps in version 2
-        with self._web.ask(STREAM_PATH, query) as response:
+        with self.web.ask(STREAM_PATH, query) as response:
             kind = response.headers.get("content-type", "")
             if response.status_code != 200 or not kind.lower().strip().startswith("multipart/"):
                 raise self._refusal(response)
-            yield Stream(boundary_of(kind), self._web.pieces(response))
+            yield Stream(boundary_of(kind), self.web.pieces(response))
 
     def _parameters(self, path: str, group: str) -> dict[str, str] | None:
         """List a group of parameters, names without "root."; {} where there are none, None where access is refused."""
-        text = self._web.text(path, {"action": "list", "group": group})
+        text = self.web.text(path, {"action": "list", "group": group})
         if text is None:
             return None
         lines = (line.strip().removeprefix("root.").partition("=") for line in text.splitlines())
         return {
-            name: self._web.quote(value) for name, equals, value in lines if equals and re.fullmatch(r"[\w.]+", name)
+            name: self.web.quote(value) for name, equals, value in lines if equals and re.fullmatch(r"[\w.]+", name)
         }
 
     def _refusal(self, response: "httpx.Response") -> DeviceError:
@@ -267,32 +259,22 @@ class VideoServer:
         if status >= 500:
             return BusyError(f"{name} fails with status {status}: restart it if that lasts")
         if 300 <= status < 400:
-            target = self._web.quote(response.headers.get("location", "another address"))
-            return RefusedError(f"{name} sends on to {target}: set hardware.fixed.url to where the server really is")
+            target = self.web.quote(response.headers.get("location", "another address"))
+            return StreamRefusedError(
+                f"{name} sends on to {target}: set hardware.fixed.url to where the server really is"
+            )
         if status == 404:
             check = "check hardware.fixed.url and hardware.fixed.camera"
-            return RefusedError(f"{name} has no {STREAM_PATH} for camera {config.camera} (404): {check}")
+            return StreamRefusedError(f"{name} has no {STREAM_PATH} for camera {config.camera} (404): {check}")
         if status != 200:
             asked = f"camera {config.camera}, resolution '{config.resolution}', compression {config.compression}"
-            return RefusedError(f"{name} refuses {asked} ({status}): check them in hardware.fixed")
-        kind = self._web.quote(response.headers.get("content-type", "")) or "something"
-        said = self._web.quote(self._web.read(response)) if kind.lower().startswith("text/plain") else ""
+            return StreamRefusedError(f"{name} refuses {asked} ({status}): check them in hardware.fixed")
+        kind = self.web.quote(response.headers.get("content-type", "")) or "something"
+        said = self.web.quote(self.web.read(response)) if kind.lower().startswith("text/plain") else ""
         said = f" '{said}'" if said else ""
-        return RefusedError(f"{name} sends {kind}{said}, no stream of pictures: check hardware.fixed.url and camera")
-
-
-def _access(config: AxisSettings) -> tuple[str, str, str]:
-    """Split the configured address into URL without login, user and password."""
-    if not config.url:
-        raise ConfigError("hardware.fixed.url: missing; give the video server's address, such as http://192.168.0.90")
-    try:
-        parts = urlsplit(config.url)
-    except ValueError:
-        raise ConfigError("hardware.fixed.url: is not like http://192.168.0.90") from None
-    user = config.user or unquote(parts.username or "")
-    password = config.password or unquote(parts.password or "") or os.environ.get(PASSWORD_VARIABLE, "")
-    host = parts.netloc.rpartition("@")[2]
-    return f"{parts.scheme}://{host}{parts.path}".rstrip("/"), user, password
+        return StreamRefusedError(
+            f"{name} sends {kind}{said}, no stream of pictures: check hardware.fixed.url and camera"
+        )
 
 
 # HTTP access to a device
@@ -340,7 +322,7 @@ class WebDevice:
                 headers={"Connection": "close", "Accept-Encoding": "identity", "User-Agent": "cotarget"},
             )
         except (self._httpx.InvalidURL, ValueError):
-            raise ConfigError(f"'{url}' is not like http://192.168.0.90") from None
+            raise ConfigError(f"hardware.fixed.url: '{url}' is not like http://192.168.0.90") from None
 
     def end(self) -> None:
         """Break off a request that another thread reads, and refuse further requests."""
@@ -513,8 +495,16 @@ class AxisCamera:
 
     @staticmethod
     def probe(settings: AxisSettings) -> str:
-        """Describe the video server in one line, by queries that change nothing; see `probe`."""
-        return probe(settings)
+        """Describe the video server in one line, by queries that change nothing.
+
+        Raises:
+            ConfigError: the settings have no address.
+            DeviceError: the server cannot be reached, reports nothing, is no Axis, or has no such input or no video.
+        """
+        server = VideoServer(settings)
+        with contextlib.closing(server.web):
+            server.check()
+            return server.describe()
 
     def __init__(self, config: AxisSettings, clock: Clock) -> None:
         self._config, self._clock = config, clock
@@ -549,20 +539,15 @@ class AxisCamera:
         return self._frames.counts
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
-
-        Raises:
-            StaleFrameError: no such frame arrived within ``timeout`` [s]; the message says why.
-            DeviceError: the image size changed, the camera is closed, or its driver failed.
-        """
+        """Wait for a frame, see `FrameBuffer.read`."""
         return self._frames.read(newer_than, timeout)
 
     def close(self) -> None:
         """End the stream and the thread; may be called again."""
         self._frames.close()
-        self._server.end()
+        self._server.web.end()
         if self._frames.join():
-            self._server.close()
+            self._server.web.close()
 
     def _stream(self) -> None:
         """Open the stream and take its images until it ends."""
@@ -605,15 +590,3 @@ class AxisCamera:
         self._asked = frames
         if video is False:
             self._frames.remark(f"its input {self._config.camera} has no video")
-
-
-def probe(config: AxisSettings) -> str:
-    """Describe the video server in one line, by queries that change nothing.
-
-    Raises:
-        ConfigError: the config has no address.
-        DeviceError: the server cannot be reached, reports nothing, is no Axis, or has no such input or no video there.
-    """
-    with contextlib.closing(VideoServer(config)) as server:
-        server.check()
-        return server.describe()

@@ -105,7 +105,7 @@ class SocketBoard:
     """A program at a socket that holds the board: a robot, or an emulated rig.
 
     Raises:
-        DeviceError: no program listens there.
+        DeviceError: no program listens there, it is gone, or a pose is not possible.
     """
 
     patience = 0.0
@@ -116,25 +116,17 @@ class SocketBoard:
             self._socket = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
         except OSError as error:
             raise DeviceError(
-                f"hardware.board.presenter: nobody holds a board at {self._name}: {error.strerror or error}"
+                f"hardware.board.presenter: no program holds a board at {self._name}: {error.strerror or error}"
             ) from None
         self._socket.settimeout(ANSWER_TIMEOUT)
         self._lines = self._socket.makefile("rb")
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
-        """Request the board at a pose, or no board, and wait until that is done.
-
-        Raises:
-            DeviceError: the pose is not possible, or the program is gone.
-        """
+        """Request the board at a pose, or no board, and wait until that is done."""
         self._ask("present", T_fixed_board)
 
     def swing(self, T_fixed_board: RigidTransform) -> None:
-        """Request a board that swings about a pose.
-
-        Raises:
-            DeviceError: that is not possible, or the program is gone.
-        """
+        """Request a board that swings about a pose."""
         self._ask("swing", T_fixed_board)
 
     def close(self) -> None:

@@ -35,7 +35,7 @@ class BusyError(DeviceError):
     """The camera has no capacity at the moment; try again later."""
 
 
-class RefusedError(DeviceError):
+class StreamRefusedError(DeviceError):
     """The camera refuses this stream."""
 
 
@@ -150,7 +150,7 @@ class FrameBuffer:
             if not self.closing:
                 after()
             pause = SHORTEST_PAUSE_S if worked else min(max(2 * pause, SHORTEST_PAUSE_S), LONGEST_PAUSE_S)
-            if isinstance(error, RefusedError):
+            if isinstance(error, StreamRefusedError):
                 pause = REFUSED_PAUSE_S
 
     def opened(self) -> None:

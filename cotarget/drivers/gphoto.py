@@ -150,7 +150,7 @@ def check_permission(port: str) -> None:
         )
 
 
-def shortened(names: Iterable[str], wanted: str, most: int = 12) -> str:
+def likeliest(names: Iterable[str], wanted: str, most: int = 12) -> str:
     """List valid choices for a message, those most like ``wanted`` first, at most ``most`` of them."""
     names = sorted(set(names))
     near = [name for name in names if wanted.lower() in name.lower()]
@@ -397,20 +397,10 @@ def cameras() -> list[str]:
         raise DeviceError(f"gphoto2 says [{error.code}] {error.string}") from error
 
 
-def probe(port: str, model: str) -> str:
-    """Detect a configured camera without opening it; describe it in one line.
-
-    Raises:
-        ConfigError: the port or model is invalid, or gphoto2 is not installed.
-        DeviceError: the camera is not there, or may not be used.
-    """
-    return GphotoLink(port, model).look()
-
-
 def _check_model(model: str, abilities: Any) -> None:
     names = {str(abilities.get_abilities(i).model) for i in range(abilities.count())}
     if model not in names:
-        raise ConfigError(f"hardware.zoom.model: gphoto2 knows no '{model}'; it knows {shortened(names, model, 5)}")
+        raise ConfigError(f"hardware.zoom.model: gphoto2 knows no '{model}'; it knows {likeliest(names, model, 5)}")
 
 
 def _listed(found: list[tuple[str, str]]) -> str:

@@ -27,14 +27,13 @@ from cotarget.drivers.gphoto import (
     GphotoLink,
     LinkError,
     Setting,
-    probe,
-    shortened,
+    likeliest,
 )
-from cotarget.drivers.lens import LensMotion, LensTable
+from cotarget.drivers.lens import LensMotion, LensPositions
 from cotarget.drivers.mjpeg import DamagedError, decode_jpeg
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.plugins import place_of
-from cotarget.rig import Clock, Frame, Image, ZoomSpec, ZoomState
+from cotarget.rig import Clock, Frame, ZoomSpec, ZoomState
 from cotarget.schema import Check, Needed, NotNegative, Positive, Size, model
 
 log = logging.getLogger(__name__)
@@ -161,7 +160,7 @@ class ZoomSetting:
     """
 
     name: str
-    lens: LensTable
+    lens: LensPositions
     values: Mapping[int, str | float]
 
 
@@ -204,7 +203,7 @@ def set_up(link: CameraLink, config: GphotoSettings, clock: Clock, camera: str) 
 
 def _apply(link: CameraLink, clock: Clock, camera: str, names: Collection[str], name: str, value: str) -> None:
     if name not in names:
-        known = shortened(names, name)
+        known = likeliest(names, name)
         raise ConfigError(f"hardware.zoom.settings: the {camera} has no setting '{name}'; valid here: {known}")
     setting = patiently(clock, lambda: link.get(name))
     _check(setting, f"hardware.zoom.settings.{name}", value)
@@ -221,7 +220,7 @@ def _check(setting: Setting, where: str, value: str) -> None:
     if setting.readonly:
         raise ConfigError(f"{where}: this camera's can only be read; it is '{setting.value}'")
     if setting.kind == "choice" and value not in setting.choices:
-        raise ConfigError(f"{where}: '{value}' is not one of: {shortened(setting.choices, value)}")
+        raise ConfigError(f"{where}: '{value}' is not one of: {likeliest(setting.choices, value)}")
     if setting.kind == "switch" and value not in ("0", "1"):
         raise ConfigError(f"{where}: '{value}' is not one of: 0, 1")
     if setting.kind == "range":
@@ -238,7 +237,7 @@ def _zoom_setting(
     """Find the setting that moves the lens, and check it against the configured lens table."""
     name, (first, last) = config.zoom_key, (config.lens[0][0], config.lens[-1][0])
     if name not in names:
-        known = shortened(names, name)
+        known = likeliest(names, name)
         raise ConfigError(
             f"hardware.zoom: the {camera} has no setting '{name}'; it cannot be zoomed; its settings are: {known}"
         )
@@ -259,7 +258,7 @@ def _zoom_setting(
     inside = tuple(sorted(position for position in values if first <= position <= last))
     if len(inside) < 2:
         raise ConfigError(f"hardware.zoom.lens: the {camera} cannot be sent to positions between {first} and {last}")
-    return ZoomSetting(name, LensTable(config.lens, inside, config.pitch_mm), values)
+    return ZoomSetting(name, LensPositions(config.lens, inside, config.pitch_mm), values)
 
 
 def _positions(setting: Setting) -> dict[int, str | float]:
@@ -452,7 +451,7 @@ class StillJob:
         except DamagedError:
             reason = f"the zoom camera's still '{still[1]}' is damaged, or no JPEG; set it to take JPEGs"
             raise DeviceError(reason) from None
-        size, wanted = size_of(image), self._config.still_size
+        size, wanted = (image.shape[1], image.shape[0]), self._config.still_size
         if size != wanted:
             raise ConfigError(
                 f"hardware.zoom.still_size: stills are {size[0]} x {size[1]}, not {wanted[0]} x {wanted[1]}; "
@@ -490,7 +489,7 @@ class ViewJob:
             data = patiently(self._clock, self._link.preview)
             arrived = self._clock.now()
             try:
-                width, height = size_of(self._frames.decode(data))
+                height, width, _ = self._frames.decode(data).shape
                 break
             except DamagedError:
                 if arrived > deadline:
@@ -534,11 +533,6 @@ class ViewJob:
 def freshness(config: GphotoSettings) -> float:
     """Return for how long a frame counts as the newest [s]."""
     return max(FRESH_S, FRESH_FRAMES / config.rate_hz)
-
-
-def size_of(image: Image) -> tuple[int, int]:
-    """Return (width, height) of an image [px]."""
-    return image.shape[1], image.shape[0]
 
 
 # The camera's thread
@@ -702,8 +696,8 @@ class GphotoCamera:
 
     @staticmethod
     def probe(settings: GphotoSettings) -> str:
-        """Detect the camera without opening it; describe it in one line. See `cotarget.drivers.gphoto.probe`."""
-        return probe(settings.port, settings.model)
+        """Detect the camera without opening it; describe it in one line. See `GphotoLink.look`."""
+        return GphotoLink(settings.port, settings.model).look()
 
     def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink | None = None) -> None:
         self._config, self._clock = config, clock
@@ -746,12 +740,7 @@ class GphotoCamera:
         return self._frames.counts
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
-
-        Raises:
-            StaleFrameError: no such frame arrived within ``timeout`` [s]; the message says why.
-            DeviceError: the frames' size has changed, or the camera is gone.
-        """
+        """Wait for a frame, see `FrameBuffer.read`."""
         return self._frames.read(newer_than, timeout)
 
     def zoom(self, focal_px: float) -> float:

@@ -83,7 +83,12 @@ class PositionLostMarker:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(f"{reason}\n", encoding="utf-8")
             except OSError as error:
-                log.error("%s: cannot be written (%s), so that nobody will remember: %s", file, error.strerror, reason)
+                log.error(
+                    "%s: cannot be written (%s), so that the next program will not know: %s",
+                    file,
+                    error.strerror,
+                    reason,
+                )
 
     def forget(self) -> None:
         """Remove the unit's markers after a reset.

@@ -6,7 +6,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class LensTable:
+class LensPositions:
     """Focal lengths of a zoom lens's positions.
 
     Attributes:

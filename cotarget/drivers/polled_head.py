@@ -3,7 +3,7 @@
 `PolledHead` is the head that the pipeline sees; a driver gives it a `HeadLink`, which speaks the unit's protocol. A
 thread runs `Loop`, the only user of the link: it polls both axes all the time and sends the commands of other threads.
 One turn of the loop is one exchange with the unit, or the few exchanges of one move. Other threads only append requests
-to queues and read the newest `Snapshot`, without locks, so that a signal handler may halt the head whatever code it
+to queues and read the newest `HeadSnapshot`, without locks, so that a signal handler may halt the head whatever code it
 interrupted.
 """
 
@@ -15,8 +15,8 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol, TypeVar
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Annotated, NamedTuple, Protocol, TypeVar
 
 from cotarget.config import SafetyConfig
 from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
@@ -24,6 +24,7 @@ from cotarget.drivers.serial_line import LostError, RefusedError, SilentError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from cotarget.plugins import place_of
 from cotarget.rig import Clock, HeadSpec, PanTiltLimits, PanTiltState, Speed
+from cotarget.schema import Limits, Needed, NotNegative, OneOf, Positive, model
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +58,11 @@ class AxisFacts:
         """Convert the limits to degrees with rig.toml's sign of the axis: lowest, highest."""
         a, b = (sign * end * math.degrees(self.step) for end in (self.lowest, self.highest))
         return min(a, b), max(a, b)
+
+
+def braking_s(axes: tuple[AxisFacts, AxisFacts]) -> float:
+    """Return the longest time to stop an axis from its highest speed [s]."""
+    return max(axis.fastest / axis.acceleration for axis in axes)
 
 
 class Poll(NamedTuple):
@@ -128,54 +134,44 @@ class HeadLink(Protocol):
         """Release the port; never raises."""
 
 
-class HeadSettings(Protocol):
-    """The settings in [hardware.head] that every polled head has."""
+@model
+class PolledHeadSettings:
+    """The settings in [hardware.head] that every polled head has.
+
+    Attributes:
+        port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
+        step_deg: step size that the unit is expected to report [degrees].
+        pan_deg: range of pan that the unit is expected to report, with positive pan to the right [degrees].
+        tilt_deg: range of tilt that the unit is expected to report, with positive tilt up [degrees].
+        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left.
+        tilt_sign: 1 where the unit's positive tilt goes up, -1 where it goes down.
+        speed_deg_s: speed of moves, at most the unit's own [degrees/s].
+        command_delay_s: time from a command to the start of motion, as measured [s].
+    """
+
+    _: KW_ONLY
+    port: Annotated[str, Needed("/dev/ttyUSB0")] = ""
+    step_deg: Positive
+    pan_deg: Limits
+    tilt_deg: Limits
+    pan_sign: Annotated[int, OneOf(-1, 1)] = 1
+    tilt_sign: Annotated[int, OneOf(-1, 1)] = 1
+    speed_deg_s: Positive
+    command_delay_s: NotNegative = 0.04
 
     @property
-    def port(self) -> str:
-        """Port of the unit."""
-
-    @property
-    def step_deg(self) -> float:
-        """Size of a step."""
-
-    @property
-    def pan_deg(self) -> tuple[float, float]:
-        """Lowest and highest pan."""
-
-    @property
-    def tilt_deg(self) -> tuple[float, float]:
-        """Lowest and highest tilt."""
-
-    @property
-    def pan_sign(self) -> int:
-        """1 where the unit's positive pan turns right, -1 where it turns left."""
-
-    @property
-    def tilt_sign(self) -> int:
-        """1 where the unit's positive tilt turns up, -1 where it turns down."""
-
-    @property
-    def speed_deg_s(self) -> float:
-        """Highest speed."""
-
-    @property
-    def command_delay_s(self) -> float:
-        """Time from a command to the start of motion."""
-
-
-def head_spec(settings: HeadSettings) -> HeadSpec:
-    """Describe a head by its settings; its acceleration is not known before it is opened."""
-    speed, step = math.radians(settings.speed_deg_s), math.radians(settings.step_deg)
-    limits = PanTiltLimits(_radians(settings.pan_deg), _radians(settings.tilt_deg), speed, math.inf, step)
-    return HeadSpec(limits, settings.command_delay_s)
+    def spec(self) -> HeadSpec:
+        """Describe the head; its acceleration is not known before it is opened."""
+        speed, step = math.radians(self.speed_deg_s), math.radians(self.step_deg)
+        limits = PanTiltLimits(_radians(self.pan_deg), _radians(self.tilt_deg), speed, math.inf, step)
+        return HeadSpec(limits, self.command_delay_s)
 
 
 # Axis positions from polls
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class HeadSnapshot:
     """Positions of both axes at one time, interpolated between polls.
 
     Attributes:
@@ -294,6 +290,23 @@ PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
 LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: a unit may answer only when it stands [s]
 
 
+def halted_at_last(link: HeadLink, reason: BaseException) -> bool:
+    """Halt the unit a last time, unless its port has failed; return whether it acknowledged that."""
+    if isinstance(reason, LostError):
+        return False
+    try:
+        link.halt_last(LOOP_HALT_S if isinstance(reason, SilentError) else LOOP_HALT_S + braking_s(link.axes))
+    except Exception as error:  # a mistake in a link must not keep a lost position from being remembered
+        log.log(
+            logging.DEBUG if isinstance(reason, SilentError) else logging.WARNING,
+            "%s: the pan-tilt unit did not acknowledge the last halt: %s",
+            link.name,
+            error,
+        )
+        return False
+    return True
+
+
 class Loop:
     """Poll the unit and send requests; the only user of the link.
 
@@ -307,7 +320,6 @@ class Loop:
         halts: requests to stop; they come before moves.
         halted: number of the newest halt that was taken out of the queue.
         closing: set when no more requests will come.
-        braking_s: longest time to stop the axes from their highest speed [s].
         rests: whether the unit acknowledged the last halt, after which nothing more is sent.
         errors: failure of a move without a waiting caller; the next call raises it.
         snapshot: the newest positions.
@@ -324,7 +336,6 @@ class Loop:
         self.halts: deque[Halt] = deque()
         self.halted = 0
         self.closing = False
-        self.braking_s = max(axis.fastest / axis.acceleration for axis in link.axes)
         self.rests = False
         self.errors: deque[DeviceError] = deque(maxlen=1)
         while not all(track.polls for track in self._tracks):
@@ -360,19 +371,11 @@ class Loop:
     def stop_for_good(self, reason: DeviceError) -> None:
         """Halt the head a last time, and end all requests with an error."""
         self.closing = True
-        if not isinstance(reason, LostError):
-            self._halt_at_last(LOOP_HALT_S if isinstance(reason, SilentError) else LOOP_HALT_S + self.braking_s)
+        self.rests = halted_at_last(self._link, reason)
         for move in [*([self._active] if self._active else []), *drained(self.moves)]:
             move.finish(reason)
         for halt in drained(self.halts):
             halt.done.set()
-
-    def _halt_at_last(self, patience: float) -> None:
-        try:
-            self._link.halt_last(patience)
-            self.rests = True
-        except Exception as error:  # a mistake in a link must not keep a lost position from being remembered
-            log.warning("%s: the pan-tilt unit did not acknowledge the last halt: %s", self._link.name, error)
 
     def _halt(self) -> None:
         requests = drained(self.halts)
@@ -389,12 +392,12 @@ class Loop:
 
     def _stop(self) -> None:
         """Send the halt and wait for its answer."""
-        self._link.halt(LOOP_HALT_S + self.braking_s)
+        self._link.halt(LOOP_HALT_S + braking_s(self._link.axes))
         self._expect_motion()
 
     def _move(self) -> None:
         # The snapshot must say moving before the request leaves the queue: PolledHead.state reads both.
-        self.snapshot = Snapshot(self.snapshot.pan, self.snapshot.tilt, True, self.snapshot.t)
+        self.snapshot = HeadSnapshot(self.snapshot.pan, self.snapshot.tilt, True, self.snapshot.t)
         requests = drained(self.moves)
         fresh = [request for request in requests if request.number > self.halted]
         for request in requests:
@@ -494,11 +497,11 @@ class Loop:
     def _stand(self) -> bool:
         return all(track.stands() for track in self._tracks)
 
-    def _look(self) -> Snapshot:
+    def _look(self) -> HeadSnapshot:
         """Make a snapshot of both axes at the older one of their newest polls."""
         pan, tilt = self._tracks
         t = min(pan.polls[-1][0], tilt.polls[-1][0])
-        return Snapshot(pan.at(t), tilt.at(t), self._active is not None or not self._stand(), t)
+        return HeadSnapshot(pan.at(t), tilt.at(t), self._active is not None or not self._stand(), t)
 
 
 # The head
@@ -535,7 +538,7 @@ class PolledHead:
     def __init__(
         self,
         open_link: Callable[[], HeadLink],
-        config: HeadSettings,
+        config: PolledHeadSettings,
         clock: Clock,
         safety: SafetyConfig = NOTHING_SAID,
     ) -> None:
@@ -546,12 +549,12 @@ class PolledHead:
         self._dead: DeviceError | None = None
         self._closed = False
         try:
-            self._link = open_link()
+            self._link = _checked(open_link())
         except BaseException as error:
             self._remember(error)
             raise
-        self.axes = self._link.axes
         try:
+            self.axes = self._link.axes
             compare(config, self.axes)
             for key, cap in (
                 ("hardware.head.speed_deg_s", config.speed_deg_s),
@@ -562,6 +565,7 @@ class PolledHead:
             self._loop = Loop(self._link, clock, config.command_delay_s)
             self._wait_until_it_stands(clock)
         except BaseException as error:
+            halted_at_last(self._link, error)
             self._remember(error)
             self._link.close()
             raise
@@ -632,7 +636,7 @@ class PolledHead:
             return
         request = Halt(next(self._numbers))
         self._loop.halts.append(request)
-        request.done.wait(HALT_S + self._loop.braking_s if self._thread.is_alive() else 0.0)
+        request.done.wait(HALT_S + braking_s(self.axes) if self._thread.is_alive() else 0.0)
         if request.answered or self._loop.rests:
             return
         if not self._thread.is_alive() and not isinstance(self._dead, LostError):
@@ -700,7 +704,21 @@ class PolledHead:
             self._loop.turn()
 
 
-def compare(config: HeadSettings, axes: tuple[AxisFacts, AxisFacts]) -> None:
+def _checked(link: HeadLink) -> HeadLink:
+    """Refuse a link that lacks a part of `HeadLink`.
+
+    Raises:
+        ConfigError: it does; the message names the part.
+    """
+    needed = ("name", *(name for name in vars(HeadLink) if not name.startswith("_")))
+    if lacks := [name for name in needed if not hasattr(link, name)]:
+        if "close" not in lacks:
+            link.close()
+        raise ConfigError(f"hardware.head.driver: {type(link).__name__} has no {lacks[0]}; HeadLink says what it needs")
+    return link
+
+
+def compare(config: PolledHeadSettings, axes: tuple[AxisFacts, AxisFacts]) -> None:
     """Compare the unit's steps and limits with rig.toml.
 
     Raises:
@@ -731,7 +749,7 @@ def _alike(found: tuple[float, float], expected: tuple[float, float]) -> bool:
     return max(abs(a - b) for a, b in zip(found, expected, strict=True)) <= LIMITS_DEG
 
 
-def _limits(axes: tuple[AxisFacts, AxisFacts], config: HeadSettings) -> PanTiltLimits:
+def _limits(axes: tuple[AxisFacts, AxisFacts], config: PolledHeadSettings) -> PanTiltLimits:
     """Convert the unit's limits to radians with the signs of rig.toml."""
     (pan, tilt), step = axes, axes[0].step
     return PanTiltLimits(

@@ -1,8 +1,6 @@
 """The pan-tilt unit PTU-D46: identify it, move it, and reset it.
 
-`D46Head` is the head of a rig, and `D46Link` its protocol as `PolledHead` asks for it. `connect` prepares a unit for
-both. `probe` queries a unit without a rig. `reset` turns the unit through its whole range to find its limits; an
-operator must have consented to it.
+`D46Head` is the head of a rig, and `D46Link` its protocol as `PolledHead` asks for it; `connect` prepares the unit.
 """
 
 import contextlib
@@ -10,35 +8,30 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 from cotarget.config import SafetyConfig
 from cotarget.drivers import ptu_protocol
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import PositionLostError, PositionLostMarker, rig_lock
-from cotarget.drivers.polled_head import NOTHING_SAID, AxisFacts, CutError, Poll, PolledHead, head_spec
-from cotarget.drivers.ptu_protocol import (
-    AXES,
-    DELIMITER,
-    HALT,
-    PATIENCE_S,
-    QUICK_S,
-    AxisName,
-    Line,
-    RestartedError,
-    command,
-    open_line,
+from cotarget.drivers.polled_head import (
+    NOTHING_SAID,
+    AxisFacts,
+    CutError,
+    Poll,
+    PolledHead,
+    PolledHeadSettings,
+    braking_s,
 )
+from cotarget.drivers.ptu_protocol import AXES, DELIMITER, HALT, PATIENCE_S, AxisName, Line, command, open_line
 from cotarget.drivers.serial_line import RefusedError, ReplyError, SilentError
 from cotarget.errors import DeviceError, EmergencyStopError
-from cotarget.rig import Clock, HeadSpec
-from cotarget.schema import Limits, Needed, NotNegative, OneOf, Positive, model
+from cotarget.rig import Clock
+from cotarget.schema import Limits, OneOf, Positive, model
 
 log = logging.getLogger(__name__)
 BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
-Meaning = TypeVar("Meaning")
 GREETINGS = 2  # to a unit that was interrupted in the middle of an exchange
-TRIES = 3  # of one exchange; the line is synchronised again before each but the first
 GREETING_QUIET_S, GREETING_MOST_S = 0.25, 1.5  # [s]; at open the unit's last command is unknown
 STILL_S = 0.035  # longer than the slowest speed, 31 steps/s, takes for a step [s]
 # A delimiter before the halt ends what noise may have left at the unit; the unit refuses that and not the halt.
@@ -46,35 +39,20 @@ HALT_NOW, HALT_TRIES = DELIMITER + HALT, 2
 
 
 @model
-class D46Settings:
+class D46Settings(PolledHeadSettings):
     """A Directed Perception PTU-D46.
 
     Attributes:
-        port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
         baud: baud rate of the serial line.
-        step_deg: step size that the unit is expected to report [degrees].
-        pan_deg: range of pan that the unit is expected to report, with positive pan to the right [degrees].
-        tilt_deg: range of tilt that the unit is expected to report, with positive tilt up [degrees].
         pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as in the D46's manual.
-        tilt_sign: 1 where the unit's positive tilt goes up, -1 where it goes down.
-        speed_deg_s: speed of moves, at most the unit's own [degrees/s].
-        command_delay_s: time from a command to the start of motion, as measured [s].
     """
 
-    port: Annotated[str, Needed("/dev/ttyUSB0")] = ""
-    baud: Annotated[int, OneOf(*BAUDS)] = 9600
     step_deg: Positive = 0.0514286
     pan_deg: Limits = (-158.9, 158.9)
     tilt_deg: Limits = (-46.6, 31.1)
     pan_sign: Annotated[int, OneOf(-1, 1)] = -1
-    tilt_sign: Annotated[int, OneOf(-1, 1)] = 1
     speed_deg_s: Positive = 149.0
-    command_delay_s: NotNegative = 0.04
-
-    @property
-    def spec(self) -> HeadSpec:
-        """Describe the unit."""
-        return head_spec(self)
+    baud: Annotated[int, OneOf(*BAUDS)] = 9600
 
 
 @dataclass(frozen=True)
@@ -94,9 +72,9 @@ class UnitInfo:
     tilt: AxisFacts
 
     @property
-    def braking_s(self) -> float:
-        """Longest time to stop from the highest speed [s]."""
-        return max(axis.fastest / axis.acceleration for axis in (self.pan, self.tilt))
+    def limits(self) -> tuple[int, int, int, int]:
+        """Lowest and highest pan, lowest and highest tilt [steps]."""
+        return self.pan.lowest, self.pan.highest, self.tilt.lowest, self.tilt.highest
 
 
 def connect(line: Line) -> UnitInfo:
@@ -107,14 +85,11 @@ def connect(line: Line) -> UnitInfo:
         DeviceError: there is no unit, or it cannot be used in its state.
     """
     greet(line)
-    try:
-        unit = identify(line)
-        refuse_uncalibrated(line.name, *((axis.lowest, axis.highest) for axis in (unit.pan, unit.tilt)))
-        _halt(line, PATIENCE_S + unit.braking_s)
-        line.query(command("I"), ptu_protocol.done, PATIENCE_S)
-        _make_independent(line)
-    except RestartedError as error:
-        raise restarted(line) from error
+    unit = identify(line)
+    refuse_uncalibrated(line.name, unit.limits)
+    line.query(HALT_NOW, ptu_protocol.done, PATIENCE_S + braking_s((unit.pan, unit.tilt)), even_if_refused=True)
+    line.query(command("I"), ptu_protocol.done, PATIENCE_S)
+    _make_independent(line)
     refuse_events(line)
     return unit
 
@@ -145,13 +120,10 @@ class D46Link:
     def poll(self) -> Sequence[Poll]:
         """Ask for the position of one axis, in turn."""
         axis = self._next
-        for left in reversed(range(TRIES)):
-            try:
-                position, t = self._exchange(command(AXES[axis] + "P"), ptu_protocol.bare_integer)
-                break
-            except RefusedError:  # the query itself may have been garbled on its way
-                if not left:
-                    raise
+        order = command(AXES[axis] + "P")
+        position, t = self._line.query(
+            order, ptu_protocol.bare_integer, even_if_refused=True, resynchronized=self._refuse_cut
+        )
         self._next = 1 - axis
         return [Poll(axis, position, t)]
 
@@ -170,16 +142,7 @@ class D46Link:
     def halt(self, patience: float) -> None:
         """Stop both axes; return when the unit has acknowledged it."""
         self._goals = [None, None]
-        for left in reversed(range(TRIES)):
-            try:
-                self._exchange(HALT_NOW, ptu_protocol.done, patience=patience)
-                return
-            except RefusedError:
-                if not left:
-                    raise
-            except CutError as error:
-                if not left:
-                    raise DeviceError(str(error)) from error
+        self._line.query(HALT_NOW, ptu_protocol.done, patience, even_if_refused=True)
 
     def halt_last(self, patience: float) -> None:
         """Stop both axes of a unit that may have been switched off and on, and may still send old answers."""
@@ -198,43 +161,15 @@ class D46Link:
         self._line.close()
 
     def _order(self, name: str, value: int, proceed: Callable[[], None]) -> None:
+        def resynchronized(error: DeviceError, halted: bool) -> None:
+            self._refuse_cut(error, halted)
+            proceed()
+
         proceed()
-        self._exchange(command(name, value), ptu_protocol.done, proceed)
+        self._line.query(command(name, value), ptu_protocol.done, resynchronized=resynchronized)
 
-    def _exchange(
-        self,
-        order: bytes,
-        understand: Callable[[str], Meaning],
-        proceed: Callable[[], None] = lambda: None,
-        patience: float = QUICK_S,
-    ) -> tuple[Meaning, float]:
-        """Send one command and read its answer; repeat after an error, once the line is synchronised.
-
-        Returns:
-            The answer's meaning, and its time [s].
-        """
-        for left in reversed(range(TRIES)):
-            try:
-                answer = self._line.ask(order, patience)
-                return understand(answer.text), answer.t
-            except (SilentError, ReplyError) as error:
-                self._synchronise(error)
-                proceed()
-                if not left:
-                    raise self._line.nonsense(error) from error
-        raise AssertionError("unreachable")
-
-    def _synchronise(self, error: DeviceError) -> None:
-        """Synchronise with the unit after an error.
-
-        Raises:
-            CutError: the unit was silent and was halted.
-            PositionLostError: the unit was switched off and on.
-        """
-        try:
-            halted = self._line.resync(error)
-        except RestartedError as found:
-            raise restarted(self._line) from found
+    def _refuse_cut(self, error: DeviceError, halted: bool) -> None:
+        """Raise CutError if the unit was halted because it was silent."""
         if halted:
             self._goals = [None, None]
             raise CutError(f"{error}, and the head was halted") from error
@@ -257,15 +192,62 @@ class D46Head(PolledHead):
 
     @staticmethod
     def probe(settings: D46Settings) -> str:
-        """Describe the unit in one line, by queries that change nothing; see `probe`."""
-        return probe(settings.port, settings.baud)
+        """Query version, network number and limits of the unit; nothing is changed.
+
+        Raises:
+            UncalibratedError: the unit has not found its limits.
+            DeviceError: there is no pan-tilt unit, or another program uses it.
+        """
+        port = settings.port
+        with rig_lock(port), contextlib.closing(open_line(port, settings.baud, MonotonicClock())) as line:
+            try:
+                line.write(DELIMITER)
+                line.drain(GREETING_QUIET_S, GREETING_MOST_S)
+                version, _ = line.ask(command("V"), PATIENCE_S)
+                if not version:
+                    raise ReplyError(f"what answers at {port} reports no version")
+                unit, *limits = (
+                    ptu_protocol.integer(line.ask(command(name), PATIENCE_S)[0])
+                    for name in ("U", "PN", "PX", "TN", "TX")
+                )
+            except (SilentError, ReplyError, RefusedError) as error:
+                raise _stranger(line) from error
+        refuse_uncalibrated(port, limits)
+        return f"{version}, unit {unit}"
 
     @staticmethod
     def reset(settings: D46Settings, clock: Clock, safety: SafetyConfig, stopped: Callable[[], str | None]) -> str:
-        """Let the unit find its limits again, and describe it in one line; see `reset`."""
-        unit = reset(settings, clock, PositionLostMarker(settings.port, safety.stop_file), stopped)
-        pan, tilt = (f"{axis.lowest} to {axis.highest}" for axis in (unit.pan, unit.tilt))
-        return f"{unit.version}: pan {pan}, tilt {tilt} steps"
+        """Let the unit find its limits again; its position counts as lost until that has succeeded.
+
+        Anything that ends the reset early, Ctrl-C included, sends a halt and waits `HALT_S` for the answer. Where none
+        comes, the error or the log says so.
+
+        Args:
+            settings: port and baud rate of the unit.
+            clock: for deadlines.
+            safety: stop file, beside which the marker file lies.
+            stopped: polled all the time; returns why the head must not move, None while it may.
+
+        Returns:
+            The unit with the limits that it found, in one line.
+
+        Raises:
+            EmergencyStopError: ``stopped`` returned a reason.
+            DeviceError: the reset failed.
+        """
+        port, lost = settings.port, PositionLostMarker(settings.port, safety.stop_file)
+        with rig_lock(port), contextlib.closing(open_line(port, settings.baud, clock)) as line:
+            greet(line)
+            _refuse_if_stopped(stopped)
+            lost.note(str(PositionLostError(port, "has begun a reset that did not come to its end")))
+            _turn(line, stopped)
+            line.hurry = lambda: False
+            _expect_both_axes(line)
+            unit = identify(line)
+            refuse_uncalibrated(port, unit.limits)
+            refuse_events(line)
+            lost.forget()
+        return "{}: pan {} to {}, tilt {} to {} steps".format(unit.version, *unit.limits)
 
     def __init__(self, config: D46Settings, clock: Clock, safety: SafetyConfig = NOTHING_SAID) -> None:
         super().__init__(lambda: _open_link(config, clock), config, clock, safety)
@@ -289,11 +271,6 @@ def refuse_events(line: Line) -> None:
     if line.events:
         what = " and ".join(dict.fromkeys(ptu_protocol.EVENT_WORDS[event] for event in line.events))
         raise PositionLostError(line.name, f"reports that {what}: it was halted, and its position may be lost")
-
-
-def restarted(line: Line) -> PositionLostError:
-    """Make the error for a unit that was switched off and on."""
-    return PositionLostError(line.name, "was switched off and on, so that its position may be lost")
 
 
 def halt_outright(line: Line, patience: float) -> None:
@@ -325,8 +302,8 @@ def greet(line: Line) -> None:
         try:
             for order in ("ED", "FT"):
                 line.ask(command(order), PATIENCE_S)
-            echoes = ptu_protocol.echoing(line.ask(command("E"), PATIENCE_S).text)
-            if not echoes and ptu_protocol.terse(line.ask(command("F"), PATIENCE_S).text):
+            echoes = ptu_protocol.echoing(line.ask(command("E"), PATIENCE_S)[0])
+            if not echoes and ptu_protocol.terse(line.ask(command("F"), PATIENCE_S)[0]):
                 line.strict = True
                 return
         except (SilentError, ReplyError, RefusedError) as error:
@@ -347,42 +324,18 @@ class UncalibratedError(DeviceError):
     """The unit has not found its limits."""
 
 
-def refuse_uncalibrated(name: str, pan: tuple[int, int], tilt: tuple[int, int]) -> None:
-    """Refuse a unit that has not found its limits, given as lowest and highest steps.
+def refuse_uncalibrated(name: str, limits: Sequence[int]) -> None:
+    """Refuse a unit that has not found its limits: lowest and highest pan, lowest and highest tilt [steps].
 
     Raises:
         UncalibratedError: an axis has no range; the message names the remedy.
     """
-    for word, (lowest, highest) in (("pan", pan), ("tilt", tilt)):
+    for word, (lowest, highest) in (("pan", limits[:2]), ("tilt", limits[2:])):
         if lowest >= highest:
             raise UncalibratedError(
                 f"the pan-tilt unit at {name} is not calibrated: its {word} goes from {lowest} to {highest}; "
                 "clear its way and run cotarget reset-head, which turns it through its whole range"
             )
-
-
-def probe(port: str, baud: int) -> str:
-    """Query version, network number and limits of the unit at a port; nothing is changed.
-
-    Raises:
-        UncalibratedError: the unit has not found its limits.
-        DeviceError: there is no pan-tilt unit, or another program uses it.
-    """
-    with rig_lock(port), contextlib.closing(open_line(port, baud, MonotonicClock())) as line:
-        try:
-            line.write(DELIMITER)
-            line.drain(GREETING_QUIET_S, GREETING_MOST_S)
-            version = line.ask(command("V"), PATIENCE_S).text
-            if not version:
-                raise ReplyError(f"what answers at {port} tells no version")
-            unit, *limits = (
-                ptu_protocol.integer(line.ask(command(name), PATIENCE_S).text) for name in ("U", "PN", "PX", "TN", "TX")
-            )
-        except (SilentError, ReplyError, RefusedError) as error:
-            raise _stranger(line) from error
-    lowest_pan, highest_pan, lowest_tilt, highest_tilt = limits
-    refuse_uncalibrated(port, (lowest_pan, highest_pan), (lowest_tilt, highest_tilt))
-    return f"{version}, unit {unit}"
 
 
 def _axis(line: Line, axis: AxisName) -> AxisFacts:
@@ -394,22 +347,11 @@ def _axis(line: Line, axis: AxisName) -> AxisFacts:
     facts = AxisFacts(step, number("N"), number("X"), number("L"), number("U"), number("A"), STILL_S)
     if not 0 <= facts.slowest <= facts.fastest or min(facts.fastest, facts.acceleration) <= 0:
         raise DeviceError(
-            f"the pan-tilt unit at {line.name} tells for {ptu_protocol.AXIS_WORDS[axis]} speeds "
+            f"the pan-tilt unit at {line.name} reports for {ptu_protocol.AXIS_WORDS[axis]} speeds "
             f"from {facts.slowest} to {facts.fastest} and an acceleration of {facts.acceleration}; "
             "restore its factory settings"
         )
     return facts
-
-
-def _halt(line: Line, patience: float) -> None:
-    """Halt a unit whose line is synchronised."""
-    for left in reversed(range(HALT_TRIES)):
-        try:
-            line.query(HALT_NOW, ptu_protocol.done, patience)
-            return
-        except RefusedError:
-            if not left:
-                raise
 
 
 def _told(line: Line, question: str) -> str:
@@ -424,7 +366,7 @@ def _make_independent(line: Line) -> None:
     """Set the unit to take positions, and not velocities alone."""
     try:
         try:
-            if ptu_protocol.independent(line.ask(command("C"), PATIENCE_S).text):
+            if ptu_protocol.independent(line.ask(command("C"), PATIENCE_S)[0]):
                 return
         except ReplyError as error:
             log.info("%s: control mode: %s", line.name, error)
@@ -460,44 +402,11 @@ NOT_HALTED = (
 )
 
 
-def reset(config: D46Settings, clock: Clock, lost: PositionLostMarker, stopped: Callable[[], str | None]) -> UnitInfo:
-    """Let the unit find its limits again; its position counts as lost until that has succeeded.
-
-    Anything that ends the reset early, Ctrl-C included, sends a halt and waits `HALT_S` for the answer. Where none
-    comes, the error or the log says so.
-
-    Args:
-        config: port and baud rate of the unit.
-        clock: for deadlines.
-        lost: marker file of the unit's port.
-        stopped: polled all the time; returns why the head must not move, None while it may.
-
-    Returns:
-        The unit, with the limits that it found.
-
-    Raises:
-        EmergencyStopError: ``stopped`` returned a reason.
-        DeviceError: the reset failed.
-    """
-    with rig_lock(config.port), contextlib.closing(open_line(config.port, config.baud, clock)) as line:
-        greet(line)
-        _refuse_if_stopped(stopped)
-        lost.note(str(PositionLostError(line.name, "has begun a reset that did not come to its end")))
-        _turn(line, stopped)
-        line.hurry = lambda: False
-        _expect_both_axes(line)
-        unit = identify(line)
-        refuse_uncalibrated(line.name, *((axis.lowest, axis.highest) for axis in (unit.pan, unit.tilt)))
-        refuse_events(line)
-        lost.forget()
-        return unit
-
-
 def _turn(line: Line, stopped: Callable[[], str | None]) -> None:
     """Send the reset and wait for its end."""
     line.hurry = lambda: stopped() is not None  # ends the wait for the reset's answer
     try:
-        said = line.ask(command("R"), RESET_S, skipping=True).text
+        said, _ = line.ask(command("R"), RESET_S, skipping=True)
         log.info("%s: reset: %s", line.name, said)
     except DeviceError as error:
         ending = _halt_after_reset(line)

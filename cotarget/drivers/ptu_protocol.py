@@ -13,29 +13,15 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, TypeVar
 
-from cotarget.drivers.serial_line import (
-    Port,
-    RefusedError,
-    ReplyError,
-    SerialLine,
-    SilentError,
-    open_port,
-)
+from cotarget.drivers.interlock import PositionLostError
+from cotarget.drivers.serial_line import Port, RefusedError, ReplyError, SerialLine, SilentError, open_port
 from cotarget.errors import DeviceError
 from cotarget.rig import Clock
 
 log = logging.getLogger(__name__)
-
-
-class RestartedError(DeviceError):
-    """The unit was switched off and on; its position may be lost."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(
-            f"the pan-tilt unit at {name} was switched off and on, so that its position may be lost; open it again"
-        )
 
 
 # Ends a command. A carriage return would too, but makes some units send a line feed before the answer.
@@ -165,38 +151,11 @@ def done(text: str) -> None:
         raise ReplyError(f"{shown(text.encode())} answers something else")
 
 
-def echoing(text: str) -> bool:
-    """Parse the answer to ``E``: whether the unit echoes.
-
-    Raises:
-        ReplyError: the answer says neither or both.
-    """
-    return _either(text, ECHO_ON, ECHO_OFF)
-
-
-def terse(text: str) -> bool:
-    """Parse the answer to ``F``: whether the unit is terse.
-
-    Raises:
-        ReplyError: the answer says neither or both.
-    """
-    return _either(text, TERSE, VERBOSE)
-
-
-def independent(text: str) -> bool:
-    """Parse the answer to ``C``: whether the unit takes positions, rather than velocities alone.
-
-    Raises:
-        ReplyError: the answer says neither or both.
-    """
-    return _either(text, INDEPENDENT, VELOCITY)
-
-
 def _number(pattern: re.Pattern[str], text: str) -> str:
     _, said, tail = text.partition(" is ")
     found = pattern.search(tail if said else text)
     if found is None:
-        raise ReplyError(f"{shown(text.encode())} tells no number")
+        raise ReplyError(f"{shown(text.encode())} has no number")
     return found[0]
 
 
@@ -208,8 +167,14 @@ def _either(text: str, one: re.Pattern[str], other: re.Pattern[str]) -> bool:
     """
     yes, no = one.search(text) is not None, other.search(text) is not None
     if yes == no:
-        raise ReplyError(f"{shown(text.encode())} does not tell the mode that was asked for")
+        raise ReplyError(f"{shown(text.encode())} names neither mode")
     return yes
+
+
+# Parse the answers to E, F and C: whether the unit echoes, is terse, takes positions rather than velocities alone.
+echoing = partial(_either, one=ECHO_ON, other=ECHO_OFF)
+terse = partial(_either, one=TERSE, other=VERBOSE)
+independent = partial(_either, one=INDEPENDENT, other=VELOCITY)
 
 
 # The line
@@ -219,6 +184,7 @@ Meaning = TypeVar("Meaning")
 PATIENCE_S = 1.0  # for an answer while a unit is opened
 QUICK_S = 0.08  # for an answer during operation: a silent unit must be noticed while it can still be halted
 LAST_S = 0.8  # for the answer that confirms that a silent unit is synchronised again
+TRIES = 3  # of a command; the line is synchronised again before each but the first
 LAST_TRIES = 10  # queries to a silent unit before it counts as dead
 HURRY_S = 0.05  # for the answer in flight when the head is to be halted
 QUIET_S = 0.03  # of silence, after which an old answer counts as complete
@@ -226,14 +192,6 @@ DRAIN_S = 0.15  # for draining, where a device never stops sending
 WORDY_ANSWER = 100  # longest answer with words and echo [bytes]
 TERSE_ANSWER = 40  # longest answer but the version's, with echo and words off [bytes]
 MOST_LINES = 64  # skipped in search of one answer
-
-
-@dataclass(frozen=True)
-class Answer:
-    """Text of an answer, and the time [s] at which the unit answered or read the queried value."""
-
-    text: str
-    t: float
 
 
 class Line(SerialLine):
@@ -253,13 +211,16 @@ class Line(SerialLine):
         self.strict = False
         self.hurry: Callable[[], bool] = lambda: False
 
-    def ask(self, order: bytes, patience: float = QUICK_S, skipping: bool = False) -> Answer:
+    def ask(self, order: bytes, patience: float = QUICK_S, skipping: bool = False) -> tuple[str, float]:
         """Send one command and wait for its answer.
 
         Args:
             order: the command with its delimiter.
             patience: how long the unit may take beyond the time on the wire [s].
             skipping: whether to skip lines that are no answers.
+
+        Returns:
+            The answer's text, and the time [s] at which the unit answered or read the queried value.
 
         Raises:
             SilentError: no complete answer came in time.
@@ -277,12 +238,17 @@ class Line(SerialLine):
         # The unit reads the value between the command's last byte and the answer's first. These are in the wrong
         # order where the line is faster than its baud rate.
         start, end = sent + len(order) * self.byte_s, first - self.byte_s
-        return Answer(reply.text, (start + end) / 2 if start <= end else (sent + first) / 2)
+        return reply.text, (start + end) / 2 if start <= end else (sent + first) / 2
 
     def query(
-        self, order: bytes, understand: Callable[[str], Meaning], patience: float = QUICK_S, tries: int = 3
+        self,
+        order: bytes,
+        understand: Callable[[str], Meaning],
+        patience: float = QUICK_S,
+        even_if_refused: bool = False,
+        resynchronized: Callable[[DeviceError, bool], None] = lambda error, halted: None,
     ) -> tuple[Meaning, float]:
-        """Send a command that is safe to repeat; return its answer's meaning and time [s].
+        """Send a command that is safe to repeat, `TRIES` times at most; return its answer's meaning and time [s].
 
         For queries, and for orders that do no harm twice; a relative move would.
 
@@ -290,18 +256,22 @@ class Line(SerialLine):
             order: the command with its delimiter.
             understand: parses the answer's text, and raises ReplyError where that is no answer.
             patience: as in `ask` [s].
-            tries: number of attempts.
+            even_if_refused: whether to repeat a refused command, which may have been garbled on its way.
+            resynchronized: called after each `resync` with its reason and result; may raise.
 
         Raises:
-            DeviceError: as `ask`, after the last attempt.
+            DeviceError: as `ask` and `resync`, after the last attempt.
         """
-        for attempt in range(tries):
+        for left in reversed(range(TRIES)):
             try:
-                answer = self.ask(order, patience)
-                return understand(answer.text), answer.t
+                text, t = self.ask(order, patience)
+                return understand(text), t
+            except RefusedError:
+                if not (even_if_refused and left):
+                    raise
             except (SilentError, ReplyError) as error:
-                self.resync(error)
-                if attempt == tries - 1:
+                resynchronized(error, self.resync(error))
+                if not left:
                     raise self.nonsense(error) from error
         raise AssertionError("unreachable")
 
@@ -316,7 +286,7 @@ class Line(SerialLine):
 
         Raises:
             SilentError: the unit does not answer any more; a halt was sent.
-            RestartedError: the unit was switched off and on.
+            PositionLostError: the unit was switched off and on.
             LostError: the port failed.
         """
         log.info("%s: back in step after: %s", self.name, reason)
@@ -324,16 +294,16 @@ class Line(SerialLine):
         self.write(DELIMITER + HALT if self.hurry() else DELIMITER)
         noise += self.drain(QUIET_S, DRAIN_S)
         if BANNER.search(noise):
-            raise RestartedError(self.name)
+            raise self._restarted()
         if self._answers(command("E"), lambda text: not echoing(text), QUICK_S):
             return False
         self.write(DELIMITER + HALT)
         if BANNER.search(self.drain(QUIET_S, DRAIN_S)):
-            raise RestartedError(self.name)
+            raise self._restarted()
         back = any(self._answers(command("F"), terse, QUICK_S) for _ in range(LAST_TRIES))
         if not (back and self._answers(command("E"), lambda text: not echoing(text), LAST_S)):
             self.write(DELIMITER + HALT)
-            raise SilentError(f"the pan-tilt unit at {self.name} does not answer any more; it was told to halt")
+            raise SilentError(f"the pan-tilt unit at {self.name} does not answer any more; a halt was sent")
         log.warning("%s: the pan-tilt unit did not answer for a while and was halted", self.name)
         return True
 
@@ -341,6 +311,9 @@ class Line(SerialLine):
         """Read until ``quiet_s`` of silence or for ``most_s`` [s]; return the bytes without events."""
         data, self._buffer = self._buffer, b""
         return self._without_events(data + self.read_until_quiet(quiet_s, most_s))
+
+    def _restarted(self) -> PositionLostError:
+        return PositionLostError(self.name, "was switched off and on, so that its position may be lost")
 
     def nonsense(self, error: DeviceError) -> DeviceError:
         """Make the error for a unit whose answers stayed invalid or absent."""
@@ -412,7 +385,7 @@ class Line(SerialLine):
                 line, _ = self._next_line(deadline)
                 line = self._without_events(line)
                 if BANNER.search(line):
-                    raise RestartedError(self.name)
+                    raise self._restarted()
                 reply = parse(line)
                 well = reply is not None and not reply.refused and right(reply.text)
             except SilentError:
@@ -422,7 +395,7 @@ class Line(SerialLine):
             if well:
                 return True
             if reply is not None and not reply.refused:
-                raise RestartedError(self.name)
+                raise self._restarted()
         return False
 
     def _without_events(self, data: bytes) -> bytes:

@@ -5,11 +5,11 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass, replace
 from numbers import Integral, Real
-from typing import Any, ClassVar, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from cotarget.config import HardwareConfig, RigConfig, SafetyConfig
+from cotarget.config import HardwareConfig, RigConfig
 from cotarget.drivers import DRIVERS
 from cotarget.drivers.board import BoardSettings, make_board
 from cotarget.drivers.clock import MonotonicClock
@@ -18,7 +18,6 @@ from cotarget.errors import ConfigError, choices
 from cotarget.plugins import FORM, Answer, Reporting, calling, check_attribute, is_own, load
 from cotarget.rig import (
     CameraSpec,
-    Clock,
     Frame,
     HeadSpec,
     PanTiltLimits,
@@ -34,13 +33,6 @@ from cotarget.schema import missing_key, validate
 # Measurements: docs/design-notes.md.
 SWITCH_INTERVAL = 5e-4
 KEY = "driver"
-# By table of [hardware] that has a driver: what the driver's settings describe, and what the opened device has.
-CAMERA = ("size", "read", "close")
-ROLES: Mapping[str, tuple[type[Any], tuple[str, ...]]] = {
-    "head": (HeadSpec, ("limits", "state", "move", "halt", "close")),
-    "fixed": (CameraSpec, CAMERA),
-    "zoom": (ZoomSpec, (*CAMERA, "still_size", "focal_range", "zoom", "state", "capture")),
-}
 
 
 def _is_frame(answer: object) -> bool:
@@ -61,21 +53,21 @@ def _are_two(attribute: Any, kind: type[Any]) -> bool:
     return isinstance(attribute, tuple) and len(attribute) == 2 and all(isinstance(each, kind) for each in attribute)
 
 
+class Role(NamedTuple):
+    """What a device of a table of [hardware] has to have.
+
+    Attributes:
+        spec: what its settings describe.
+        attributes: its attributes, and what they have to be.
+        methods: its methods, and what they have to return; None for nothing.
+    """
+
+    spec: type[Any]
+    attributes: Mapping[str, Answer]
+    methods: Mapping[str, Answer | None]
+
+
 FRAME = Answer(_is_frame, "a Frame, whose image is (H, W, 3) BGR of uint8")
-# By table of [hardware] that has a driver: what methods of the opened device have to return.
-ANSWERS: Mapping[str, Mapping[str, Answer]] = {
-    "head": {
-        "state": Answer(lambda answer: isinstance(answer, PanTiltState), "a PanTiltState"),
-        "move": Answer(lambda answer: _are_numbers(answer, 2), "pan and tilt as commanded [rad]"),
-    },
-    "fixed": {"read": FRAME},
-    "zoom": {
-        "read": FRAME,
-        "capture": FRAME,
-        "state": Answer(lambda answer: isinstance(answer, ZoomState), "a ZoomState"),
-        "zoom": Answer(lambda answer: isinstance(answer, Real), "the focal length that the lens will reach [px]"),
-    },
-}
 SIZE = Answer(
     lambda size: _are_two(size, Integral) and min(size) > 0,
     "(width, height) [px], a tuple of two whole numbers above zero",
@@ -83,26 +75,30 @@ SIZE = Answer(
 FOCAL_RANGE = Answer(
     lambda ends: _are_two(ends, Real) and 0 < ends[0] <= ends[1], "(shortest, longest) focal length [px], a tuple"
 )
-# By table of [hardware] that has a driver: what attributes of the opened device have to be.
-ATTRIBUTES: Mapping[str, Mapping[str, Answer]] = {
-    "head": {"limits": Answer(lambda limits: isinstance(limits, PanTiltLimits), "a PanTiltLimits of cotarget.rig")},
-    "fixed": {"size": SIZE},
-    "zoom": {"size": SIZE, "still_size": SIZE, "focal_range": FOCAL_RANGE},
+ROLES: Mapping[str, Role] = {
+    "head": Role(
+        HeadSpec,
+        {"limits": Answer(lambda limits: isinstance(limits, PanTiltLimits), "a PanTiltLimits of cotarget.rig")},
+        {
+            "state": Answer(lambda answer: isinstance(answer, PanTiltState), "a PanTiltState"),
+            "move": Answer(lambda answer: _are_numbers(answer, 2), "pan and tilt as commanded [rad]"),
+            "halt": None,
+            "close": None,
+        },
+    ),
+    "fixed": Role(CameraSpec, {"size": SIZE}, {"read": FRAME, "close": None}),
+    "zoom": Role(
+        ZoomSpec,
+        {"size": SIZE, "still_size": SIZE, "focal_range": FOCAL_RANGE},
+        {
+            "read": FRAME,
+            "capture": FRAME,
+            "state": Answer(lambda answer: isinstance(answer, ZoomState), "a ZoomState"),
+            "zoom": Answer(lambda answer: isinstance(answer, Real), "the focal length that the lens will reach [px]"),
+            "close": None,
+        },
+    ),
 }
-
-
-class Driver(Protocol):
-    """A class that opens a device; the device keeps one of the Protocols of `cotarget.rig`, and has `close`.
-
-    Attributes:
-        Settings: dataclass of the device's table in rig.toml, with a property ``spec`` that describes the device before
-            it is opened: a CameraSpec, ZoomSpec or HeadSpec.
-    """
-
-    Settings: ClassVar[type[Any]]
-
-    def __call__(self, settings: Any, clock: Clock, safety: SafetyConfig = ..., /) -> Any:
-        """Open the device; ``safety`` is passed to heads alone."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +107,7 @@ class Device:
 
     Attributes:
         role: "head", "fixed" or "zoom".
-        driver: see `Driver`.
+        driver: class that opens the device; docs/drivers.md says what it has.
         settings: an instance of ``driver.Settings``.
         own: whether the driver is a user's own.
     """
@@ -134,7 +130,7 @@ class Device:
             ConfigError: they do not describe such a device.
         """
         with calling(self.where):
-            spec, wanted = self.settings.spec, ROLES[self.role][0]
+            spec, wanted = self.settings.spec, ROLES[self.role].spec
         if not isinstance(spec, wanted):
             raise ConfigError(f"{self.where}.{KEY}: spec of its Settings is no {wanted.__name__} of cotarget.rig")
         return spec
@@ -174,16 +170,17 @@ class Device:
         """
         if not self.own:
             return self.driver(self.settings, *arguments)
+        role = ROLES[self.role]
         with calling(self.where):
             device = self.driver(self.settings, *arguments)
-            lacks = [name for name in ROLES[self.role][1] if not hasattr(device, name)]
+            lacks = [name for name in (*role.attributes, *role.methods) if not hasattr(device, name)]
         if lacks:
             raise ConfigError(
                 f"{self.where}.{KEY}: {self.driver.__name__} has no {lacks[0]}; docs/drivers.md says what it needs"
             )
         with contextlib.ExitStack() as opened:
-            own = opened.enter_context(contextlib.closing(Reporting(device, self.where, ANSWERS[self.role])))
-            for name, answer in ATTRIBUTES[self.role].items():
+            own = opened.enter_context(contextlib.closing(Reporting(device, self.where, role.methods)))
+            for name, answer in role.attributes.items():
                 check_attribute(device, name, self.where, answer)
             opened.pop_all()
         return own

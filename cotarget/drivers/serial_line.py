@@ -132,15 +132,9 @@ class SerialLine:
 
 
 def ports() -> list[tuple[str, str]]:
-    """List this machine's serial ports: name and description of each.
+    """List this machine's serial ports: name and description of each."""
+    from serial.tools import list_ports
 
-    Raises:
-        DeviceError: pyserial is missing.
-    """
-    try:
-        from serial.tools import list_ports
-    except ImportError as error:
-        raise _no_pyserial(error) from error
     return [(port.device, port.description) for port in list_ports.comports()]
 
 
@@ -153,10 +147,8 @@ def open_port(name: str, baud: int) -> Port:
     """
     if not name:
         raise ConfigError("hardware.head.port: names no port, such as /dev/ttyUSB0 or socket://host:4000")
-    try:
-        import serial
-    except ImportError as error:
-        raise _no_pyserial(error) from error
+    import serial
+
     url = "://" in name
     try:
         # Exclusive: two programs on one port would read each other's answers.
@@ -165,10 +157,6 @@ def open_port(name: str, baud: int) -> Port:
         )
     except Exception as error:  # pyserial's handlers of URLs raise exceptions of many types
         raise _why_not(name, error) from error
-
-
-def _no_pyserial(error: ImportError) -> DeviceError:
-    return DeviceError(f"pyserial cannot be imported ({error}); pip install --force-reinstall pyserial")
 
 
 def _why_not(name: str, error: Exception) -> DeviceError:

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -159,15 +158,14 @@ def test_help_lists_faults_and_exit_statuses(capsys, command, words):
 @pytest.fixture
 def resets(monkeypatch):
     """Resets that were asked for, none of which is done."""
-    axis = SimpleNamespace(lowest=-3090, highest=3090)
     asked = []
 
-    def reset(config, clock, lost, stopped):
+    def reset(settings, clock, safety, stopped):
         assert stopped() is None
-        asked.append(config.port)
-        return SimpleNamespace(version="v2.12.1d1", pan=axis, tilt=axis)
+        asked.append(settings.port)
+        return "v2.12.1d1: pan -3090 to 3090, tilt -3090 to 3090 steps"
 
-    monkeypatch.setattr(ptu_d46, "reset", reset)
+    monkeypatch.setattr(ptu_d46.D46Head, "reset", staticmethod(reset))
     return asked
 
 

@@ -1,10 +1,8 @@
 """The driver of the Axis video server against a scripted server on loopback, which shares no code with it."""
 
 import base64
-import concurrent.futures
 import contextlib
 import hashlib
-import itertools
 import logging
 import queue
 import re
@@ -20,17 +18,15 @@ import numpy as np
 import pytest
 
 from cotarget.drivers import axis, frame_buffer
-from cotarget.drivers.axis import AxisCamera, AxisSettings, probe
+from cotarget.drivers.axis import AxisCamera, AxisSettings, LoginError
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.mjpeg import USUAL
-from cotarget.emulators.axis_241q import AxisServer
-from cotarget.emulators.plant import Feed, Picture
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
+from tests.support.emulated_devices import FEED_SIZE, axis_server, picture_number
 
 pytestmark = pytest.mark.wire
 PARAM, STATUS, VIDEO = "/axis-cgi/param.cgi", "/axis-cgi/videostatus.cgi", "/axis-cgi/mjpg/video.cgi"
 SIZE = (64, 48)
-PASSWORD = "hunter2 & co"
+USER, PASSWORD = "root", "hunter2 & co"
 PATIENCE_S = 10.0  # for what should come at once, on a machine that has much else to do
 HANG_S = 120.0  # longer than any test takes; then a mistake is no hang, but a failure
 SHORT_SILENCE_S = 0.4  # instead of the driver's two seconds
@@ -205,16 +201,16 @@ def until(camera, t, words):
     return said
 
 
-def test_frames_carry_the_time_of_their_first_byte_and_are_never_handed_out_twice(server):
+def decoded(index):
+    return cv2.imdecode(np.frombuffer(jpeg(index), np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_frames_carry_the_time_of_their_first_byte(server):
     clock = MonotonicClock()
     with opened(server) as camera:
         viewer = server.viewer()
         first = camera.read()
-        assert camera.size == SIZE
-        assert first.image.shape == (48, 64, 3)
-        np.testing.assert_array_equal(first.image, cv2.imdecode(np.frombuffer(jpeg(0), np.uint8), cv2.IMREAD_COLOR))
-        assert not first.image.flags.writeable
-        assert camera.read().t == first.t
+        np.testing.assert_array_equal(first.image, decoded(0))
         whole = part(jpeg(1))
         before = clock.now()
         viewer.send(whole[:200])
@@ -223,8 +219,7 @@ def test_frames_carry_the_time_of_their_first_byte_and_are_never_handed_out_twic
         viewer.send(whole[200:])
         second = camera.read(first.t, PATIENCE_S)
         assert before <= second.t + LATENCY_S <= between
-        np.testing.assert_array_equal(second.image, cv2.imdecode(np.frombuffer(jpeg(1), np.uint8), cv2.IMREAD_COLOR))
-        stale(camera, second.t)
+        np.testing.assert_array_equal(second.image, decoded(1))
         assert (camera.counts.frames, camera.counts.refused, camera.counts.reconnects) == (2, 0, 0)
 
 
@@ -237,8 +232,7 @@ def test_the_newest_of_many_is_read(server):
         while camera.counts.frames < 30:
             t = camera.read(t, PATIENCE_S).t
             assert time.monotonic() < deadline
-        newest = cv2.imdecode(np.frombuffer(jpeg(29), np.uint8), cv2.IMREAD_COLOR)
-        np.testing.assert_array_equal(camera.read().image, newest)
+        np.testing.assert_array_equal(camera.read().image, decoded(29))
 
 
 def test_the_stream_is_asked_for_as_configured(server):
@@ -254,9 +248,12 @@ def test_the_stream_is_asked_for_as_configured(server):
     assert server.requests[-1].query == {"camera": "1", "compression": "30", "fps": "25"}
 
 
-@pytest.mark.parametrize("missing", [PARAM, STATUS])
-def test_a_server_without_parameters_or_states_is_taken_as_it_is(server, missing):
-    del server.pages[missing]
+NOT_FOUND, ENDLESS = reply("404 Not Found"), reply(body=bytes(200_000))
+
+
+@pytest.mark.parametrize(("path", "page"), [(PARAM, NOT_FOUND), (STATUS, NOT_FOUND), (PARAM, ENDLESS)])
+def test_a_server_that_tells_nothing_of_itself_is_taken_as_it_is(server, path, page):
+    server.pages[path] = page
     with opened(server) as camera:
         assert camera.read().image.shape == (48, 64, 3)
 
@@ -338,15 +335,17 @@ def test_authentication_may_change_while_the_camera_is_open(server):
 
 
 @pytest.mark.parametrize("scheme", CHALLENGES)
-def test_a_wrong_password_is_told_without_telling_it(server, scheme, monkeypatch, caplog):
+def test_a_wrong_password_is_told_without_telling_it(server, scheme, caplog):
     caplog.set_level(logging.DEBUG)
     guard(server, scheme, password="another")
-    said = refused(server, user="root", password=PASSWORD)
-    assert said.startswith(f"{server.url} refuses the user 'root' (401): check hardware.fixed.user and the password")
-    assert "hunter2" not in said + caplog.text
-    said = refused(server, user="root")
-    assert said.endswith("asks for user and password: set the environment variable COTARGET_PASSWORD")
-    assert refused(server).endswith("set hardware.fixed.user and the environment variable COTARGET_PASSWORD")
+    for given, remedy in (
+        ({"user": "root", "password": PASSWORD}, "check hardware.fixed.user and the password"),
+        ({"user": "root"}, "set the environment variable COTARGET_PASSWORD"),
+        ({}, "set hardware.fixed.user and the environment variable COTARGET_PASSWORD"),
+    ):
+        said = refused(server, LoginError, **given)
+        assert remedy in said
+        assert "hunter2" not in said + caplog.text
 
 
 @pytest.mark.parametrize(
@@ -358,69 +357,55 @@ def test_a_challenge_that_makes_no_sense_is_one_line(server, challenge):
     assert refused(server, user="root", password="x").startswith(server.url)
 
 
+# What the server answers, what is configured otherwise, and the key or status that the error names.
 REFUSALS = {
-    "nothing there": ({VIDEO: reply("404 Not Found")}, {}, "has no /axis-cgi/mjpg/video.cgi for camera 1 (404): check"),
-    "wrong resolution": ({VIDEO: reply("400 Bad Request")}, {}, "refuses camera 1, resolution '4CIF', compression 30"),
-    "not allowed": ({VIDEO: reply("403 Forbidden")}, {"user": "eve"}, "refuses the user 'eve' (403): check hardware"),
-    "elsewhere": (
-        {VIDEO: reply("302 Found", b"", "text/html", "Location: https://cam/x")},
-        {},
-        "sends on to https://cam/x: set hardware.fixed.url to where the server really is",
-    ),
-    "a page": (
-        {VIDEO: reply(kind="text/html")},
-        {},
-        "sends text/html, no stream of pictures: check hardware.fixed.url",
-    ),
-    "an error in words": (
-        {VIDEO: reply(body=b"# Error: no\nsuch")},
-        {},
-        "sends text/plain '# Error: no such', no stream",
-    ),
-    "another make": (
-        {PARAM: reply(body=b"root.Brand.Brand=Acme\n")},
-        {},
-        "is a 'Acme', no Axis: check hardware.fixed.url",
-    ),
-    "no such input": ({}, {"camera": 5}, "has no camera 5: set hardware.fixed.camera to 1 to 4"),
-    "no signal": ({STATUS: reply(body=b"Video 1 = no video\n")}, {}, "has no video on input 1: check its cable, or"),
-    "no HTTP": ({PARAM: b"220 mail.example.org ESMTP\r\n"}, {}, "does not speak HTTP as it should"),
-    "half a head": ({VIDEO: STREAM[:30]}, {}, "does not speak HTTP as it should"),
+    "nothing there": ({VIDEO: reply("404 Not Found")}, {}, "hardware.fixed.camera"),
+    "wrong resolution": ({VIDEO: reply("400 Bad Request")}, {}, "resolution '4CIF'"),
+    "not allowed": ({VIDEO: reply("403 Forbidden")}, {"user": "eve"}, "hardware.fixed.user"),
+    "elsewhere": ({VIDEO: reply("302 Found", b"", "text/html", "Location: https://cam/x")}, {}, "https://cam/x"),
+    "a page": ({VIDEO: reply(kind="text/html")}, {}, "text/html"),
+    "an error in words": ({VIDEO: reply(body=b"# Error: no\nsuch")}, {}, "'# Error: no such'"),
+    "another make": ({PARAM: reply(body=b"root.Brand.Brand=Acme\n")}, {}, "'Acme'"),
+    "no such input": ({}, {"camera": 5}, "hardware.fixed.camera to 1 to 4"),
+    "no signal": ({STATUS: reply(body=b"Video 1 = no video\n")}, {}, "no video on input 1"),
+    "out of order": ({VIDEO: reply("500 Internal Server Error")}, {}, "500"),
+    "no HTTP": ({PARAM: b"220 mail.example.org ESMTP\r\n"}, {}, "HTTP"),
+    "half a head": ({VIDEO: STREAM[:30]}, {}, "HTTP"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSALS)
-def test_a_server_that_cannot_serve_is_told_in_a_line(server, name):
+def test_a_server_that_cannot_serve_is_told_in_a_line(server, name, monkeypatch):
+    monkeypatch.setattr(axis, "OPEN_S", 0.5)
     pages, changes, words = REFUSALS[name]
     server.pages |= pages
-    assert refused(server, **changes).startswith(f"{server.url} {words}")
+    said = refused(server, **changes)
+    assert said.startswith(server.url)
+    assert words in said
 
 
 def test_nobody_at_the_address():
     with socket.create_server(("127.0.0.1", 0)) as unused:
-        port = unused.getsockname()[1]
-    with pytest.raises(DeviceError, match=rf"http://127.0.0.1:{port} cannot be reached \(.*refused\): check"):
-        AxisCamera(AxisSettings(url=f"http://127.0.0.1:{port}"), MonotonicClock())
-
-
-@pytest.mark.parametrize(
-    ("url", "words"),
-    [("", "missing; give the video server's address"), ("http://[::1", "is not like http"), ("http://a b", "")],
-)
-def test_an_address_that_is_none(url, words):
-    with pytest.raises((ConfigError, DeviceError), match=words or "http"):
+        url = f"http://127.0.0.1:{unused.getsockname()[1]}"
+    with pytest.raises(DeviceError, match=f"^{url} cannot be reached"):
         AxisCamera(AxisSettings(url=url), MonotonicClock())
+
+
+def test_an_address_that_httpx_refuses():
+    with pytest.raises(ConfigError, match=r"^hardware\.fixed\.url: "):
+        AxisCamera(AxisSettings(url="http://a\x01b"), MonotonicClock())
 
 
 def test_httpx_is_named_where_it_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "httpx", None)
-    with pytest.raises(MissingPackageError, match=r"need httpx: pip install 'cotarget\[hardware\]'"):
+    with pytest.raises(MissingPackageError, match=r"cotarget\[hardware\]"):
         AxisCamera(AxisSettings(url="http://127.0.0.1"), MonotonicClock())
 
 
 def test_another_size_than_configured(server):
     said = refused(server, ConfigError, size=(704, 576))
-    assert said.startswith(f"hardware.fixed.size: [704, 576] is not what {server.url} sends: write size = [64, 48], or")
+    assert said.startswith("hardware.fixed.size: ")
+    assert "size = [64, 48]" in said
 
 
 def test_a_busy_server_is_asked_again(server, monkeypatch):
@@ -430,7 +415,7 @@ def test_a_busy_server_is_asked_again(server, monkeypatch):
         camera.read()
     monkeypatch.setattr(axis, "OPEN_S", 0.3)
     server.pages[VIDEO] = reply("503 Service Unavailable")
-    assert refused(server) == f"{server.url} is busy (503), perhaps with too many viewers: close some"
+    assert "busy" in refused(server)
 
 
 @pytest.mark.parametrize("sent", [b"", STREAM, STREAM + b"--myboundary\r\nContent-Type: text/plain\r\n\r\nno"])
@@ -452,13 +437,6 @@ def test_a_cut_stream_is_opened_again(server):
         t = camera.read(t, PATIENCE_S).t
         assert time.monotonic() - begun < PATIENCE_S / 2
         assert (camera.counts.frames, camera.counts.refused, camera.counts.reconnects) == (2, 1, 1)
-        server.pages[VIDEO] = reply("503 Service Unavailable")
-        for viewer in server.all:
-            viewer.cut()
-        said = until(camera, t, "busy")
-        assert re.search(r"no new picture for \d\.\d s: .* is busy \(503\).*; reconnecting", said)
-        server.pages[VIDEO] = STREAM + part(jpeg(3))
-        camera.read(t, PATIENCE_S)
 
 
 def test_a_password_that_changed_is_told_and_not_tried_in_haste(server, monkeypatch):
@@ -492,25 +470,6 @@ def test_a_stalled_stream_is_opened_again(server, monkeypatch):
         assert "video" not in stale(camera, t)
 
 
-def test_a_picture_that_is_not_due_yet_is_told_so(server, monkeypatch):
-    monkeypatch.setattr(frame_buffer, "QUIET_S", PATIENCE_S)
-    with opened(server) as camera:
-        server.viewer().send(part(jpeg(1)))
-        camera.read(camera.read().t - 1.0)
-        assert (
-            stale(camera, camera.read().t + 100.0, 0.0)
-            == f"the fixed camera at {server.url} sent no newer picture within 0 s"
-        )
-
-
-def test_silence_is_told_before_the_stream_is_given_up(server):
-    with opened(server) as camera:
-        said = until(camera, camera.read().t, "has sent nothing for")
-        assert re.fullmatch(
-            rf"no new picture for \d\.\d s: the fixed camera at {server.url} has sent nothing for \d\.\d s", said
-        )
-
-
 def test_bytes_without_pictures_do_not_go_on_for_ever(server, monkeypatch):
     monkeypatch.setattr(axis, "SILENCE_S", SHORT_SILENCE_S)
     with opened(server) as camera:
@@ -529,95 +488,20 @@ def test_bytes_without_pictures_do_not_go_on_for_ever(server, monkeypatch):
         camera.read(t, PATIENCE_S)
 
 
-def damaged(kind, index):
-    """A picture whose markers are all right and whose data are not."""
-    noise = np.random.default_rng(index).integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
-    picture = cv2.imencode(".jpg", noise)[1].tobytes()
-    data = picture.index(b"\xff\xda") + 14
-    middle = (data + len(picture)) // 2
-    match kind:
-        case "tables":
-            table = picture.index(b"\xff\xc4") + 5
-            return picture[:table] + b"\xfe" * 16 + picture[table + 16 :]
-        case "ends early":
-            return picture[:middle].rstrip(b"\xff") + b"\xff\xd9"
-
-
-@pytest.mark.parametrize("kind", ["tables", "ends early"])
-def test_damaged_pictures_are_dropped_and_counted_when_they_are_read(server, kind, capfd):
+@pytest.mark.parametrize("whole", [True, False])
+def test_damaged_pictures_are_dropped_and_counted(server, whole, capfd):
+    """One ends in the middle of its data, with a last marker or without it."""
+    picture = jpeg(1)
+    damaged = picture[: (picture.index(b"\xff\xda") + len(picture)) // 2].rstrip(b"\xff") + b"\xff\xd9" * whole
     with opened(server) as camera:
         viewer = server.viewer()
         t = camera.read().t
-        viewer.send(part(damaged(kind, 1)))
-        until(camera, t, f"the pictures of the fixed camera at {server.url} are broken")
-        assert (camera.counts.frames, camera.counts.refused) == (2, 1)
+        viewer.send(part(damaged) + b"--myboundary\r\n")
+        until(camera, t, "broken")
+        assert camera.counts.refused == 1
         viewer.send(part(jpeg(2)))
         assert camera.read(t, PATIENCE_S).t > t
     assert capfd.readouterr() == ("", "")
-
-
-def test_cut_pictures_are_dropped_and_counted(server):
-    with opened(server) as camera:
-        viewer = server.viewer()
-        t = camera.read().t
-        viewer.send(part(jpeg(1)[:-100]) + part(jpeg(2)[:-2]))
-        until(camera, t, f"the pictures of the fixed camera at {server.url} are broken")
-        viewer.send(part(jpeg(3)))
-        assert camera.read(t, PATIENCE_S).image.shape == (48, 64, 3)
-        assert (camera.counts.frames, camera.counts.refused) == (2, 2)
-
-
-@pytest.mark.parametrize("padding", [b"\xff" * 10, bytes(777)])
-def test_bytes_too_many_in_all_pictures_do_no_harm(server, padding):
-    """As in issue 51 of axis_camera: extraneous bytes before the last marker; the first such pictures are refused."""
-    numbers = range(3 * USUAL)
-    server.pages[VIDEO] = lambda _: STREAM
-    with concurrent.futures.ThreadPoolExecutor() as pool:
-        opening = pool.submit(AxisCamera, config(server), MonotonicClock())
-        viewer = server.viewer()
-        for index in numbers:
-            picture = jpeg(index)
-            viewer.send(part(picture[:-2] + padding + picture[-2:]))
-            time.sleep(0.01)
-        with contextlib.closing(opening.result()) as camera:
-            newest = cv2.imdecode(np.frombuffer(jpeg(numbers[-1]), np.uint8), cv2.IMREAD_COLOR)
-            np.testing.assert_array_equal(camera.read().image, newest)
-            assert camera.counts.refused <= USUAL
-
-
-def test_the_same_picture_again_is_no_new_one(server, monkeypatch):
-    monkeypatch.setattr(axis, "FROZEN_S", 0.3)
-    with opened(server) as camera:
-        t = camera.read().t
-        server.viewer().send(part(jpeg(0)) * 3)
-        until(camera, t, "repeats the same picture")
-        assert camera.counts.repeated >= 3
-        server.pages[STATUS] = reply(body=b"Video 1 = no video\n")
-        deadline = time.monotonic() + PATIENCE_S
-        # It asks once, on the way to a new stream, and stays with that.
-        while not stale(camera, t).endswith("repeats the same picture; its input 1 has no video"):
-            for viewer in server.all:
-                with contextlib.suppress(OSError):
-                    viewer.send(part(jpeg(0)))
-            assert time.monotonic() < deadline
-        server.all[-1].send(part(jpeg(1)))
-        assert camera.read(t, PATIENCE_S).t > t
-        assert (camera.counts.frames, camera.counts.reconnects) == (2, 1)
-
-
-def test_a_changed_size_is_an_error_until_it_is_changed_back(server):
-    with opened(server) as camera:
-        viewer = server.viewer()
-        t = camera.read().t
-        viewer.send(part(jpeg(1, (32, 24))))
-        with pytest.raises(DeviceError, match="now sends 32x24 where it sent 64x48: set its resolution back"):
-            camera.read(t, PATIENCE_S)
-        viewer.send(part(jpeg(2)))
-        deadline, image = time.monotonic() + PATIENCE_S, None
-        while image is None and time.monotonic() < deadline:
-            with contextlib.suppress(DeviceError):
-                image = camera.read(t).image
-        assert image is not None
 
 
 def test_closing_frees_a_reader_at_once_and_ends_the_thread(server):
@@ -634,7 +518,7 @@ def test_closing_frees_a_reader_at_once_and_ends_the_thread(server):
     reader.start()
     begun = time.monotonic()
     camera.close()
-    assert said.get(timeout=PATIENCE_S) == f"the fixed camera at {server.url} is closed"
+    assert "closed" in said.get(timeout=PATIENCE_S)
     assert time.monotonic() - begun < axis.SILENCE_S  # it did not wait for the socket
     ended(reader)
     camera.close()
@@ -650,14 +534,13 @@ def test_a_driver_that_fails_says_so_to_whoever_reads(server, monkeypatch, capfd
 
     if at_once:
         monkeypatch.setattr(axis.MultipartReader, "feed", feed)
-        said = f"the driver of the fixed camera at {server.url} failed: RuntimeError('a mistake')"
-        assert refused(server).startswith(said)
+        assert "RuntimeError('a mistake')" in refused(server)
     else:
         with opened(server) as camera:
             t = camera.read().t
             monkeypatch.setattr(axis.MultipartReader, "feed", feed)
             server.viewer().send(part(jpeg(1)))
-            with pytest.raises(DeviceError, match=r"the driver of the fixed camera at .* failed: RuntimeError"):
+            with pytest.raises(DeviceError, match="RuntimeError"):
                 camera.read(t, PATIENCE_S)
     assert capfd.readouterr() == ("", "")
 
@@ -671,77 +554,30 @@ def test_closing_while_the_server_hangs(server, monkeypatch):
 
 
 def test_probe_tells_who_it_is(server):
+    probe = AxisCamera.probe
     assert probe(config(server)) == "AXIS 241Q, firmware 4.48, input 1 has video"
     server.pages[STATUS] = reply(body=b"Video 2 = no video\n")
-    with pytest.raises(DeviceError, match="has no video on input 2: check its cable"):
+    with pytest.raises(DeviceError, match="no video on input 2"):
         probe(config(server, camera=2))
     assert not [request for request in server.requests if request.path == VIDEO]
-    video = server.pages[VIDEO]
+    server.pages = {VIDEO: server.pages[VIDEO]}
+    assert probe(config(server)) == "does not say what it is, but sends pictures"
     server.pages.clear()
-    server.pages[VIDEO] = video
-    assert probe(config(server)) == "tells nothing of itself, but sends pictures"
-    server.pages.clear()
-    with pytest.raises(DeviceError, match=r"\(404\): check hardware\.fixed\.url and hardware\.fixed\.camera"):
+    with pytest.raises(DeviceError, match="404"):
         probe(config(server))
 
 
-def test_a_slow_consumer_sees_fresh_pictures(server):
-    """25 pictures a second, read at 5 Hz: what is read is never older than the interval and a thread's delay."""
-    pictures, clock, ages, end = [part(jpeg(i)) for i in range(50)], MonotonicClock(), [], threading.Event()
-    with opened(server, latency_s=0.0) as camera:
-        viewer = server.viewer()
-
-        def send():
-            for picture in pictures:
-                viewer.send(picture)
-                if end.wait(0.04):
-                    return
-
-        sender = threading.Thread(target=send)
-        sender.start()
-        camera.read(camera.read().t, PATIENCE_S)
-        for _ in range(8):
-            clock.sleep_until(clock.now() + 0.2)
-            frame = camera.read()
-            ages.append(clock.now() - frame.t)
-        end.set()
-        ended(sender)
-    assert float(np.median(ages)) < LOOSE_AGE_S
-
-
 # Against the emulator, which was written by others from the same manuals
+
+
 @pytest.fixture
 def emulated():
-    """A 241Q whose input shows a new picture 25 times a second, each with its number in its first pixels."""
-    feed, sent, end = Feed(), {}, threading.Event()
-    rng = np.random.default_rng(0)
-    scene = cv2.resize(rng.integers(0, 255, (15, 20, 3), dtype=np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
-
-    def publish():
-        for index in itertools.count():
-            image = cv2.add(scene, rng.integers(0, 5, scene.shape, dtype=np.uint8))
-            for bit in range(16):
-                image[:16, 16 * bit : 16 * bit + 16] = 255 * (index >> bit & 1)
-            feed.publish(Picture(image, index, time.monotonic()))
-            if end.wait(0.04):
-                return
-
-    publisher = threading.Thread(target=publish, daemon=True)
-    publisher.start()
-    with AxisServer({1: feed}, user="root", password=PASSWORD, sent=sent.__setitem__) as unit:
-        unit.sent = sent
+    with axis_server() as unit:
         yield unit
-    end.set()
-    ended(publisher)
 
 
-def watching(unit, **changes):
-    changes = {"size": (320, 240), "resolution": "320x240", "user": "root", "password": PASSWORD} | changes
-    return opened(unit, **changes)
-
-
-def number(image):
-    return sum(int(image[4:12, 16 * bit + 4 : 16 * bit + 12].mean() > 127) << bit for bit in range(16))
+def watching(unit):
+    return opened(unit, size=FEED_SIZE, resolution="320x240", user=USER, password=PASSWORD)
 
 
 def test_emulated_pictures_are_dated_by_their_first_byte(emulated):
@@ -750,66 +586,50 @@ def test_emulated_pictures_are_dated_by_their_first_byte(emulated):
         for _ in range(10):
             frame = camera.read(frame.t, PATIENCE_S)
             # The driver cannot have seen it before it was sent.
-            delay = frame.t + LATENCY_S - emulated.sent[number(frame.image)]
+            delay = frame.t + LATENCY_S - emulated.sent[picture_number(frame.image)]
             assert 0 <= delay < LOOSE_AGE_S
         assert camera.counts.refused == 0
-    assert probe(config(emulated, user="root", password=PASSWORD)) == "AXIS 241Q, firmware 4.48, input 1 has video"
 
 
-@pytest.mark.parametrize("fault", ["wrong-length", "no-length", "dashed-boundary"])
-def test_what_the_emulator_writes_oddly_is_read(emulated, fault):
-    emulated.faults.set(fault)
-    with watching(emulated) as camera:
-        frame = camera.read()
-        for _ in range(5):
-            frame = camera.read(frame.t, PATIENCE_S)
-        assert (camera.counts.refused, camera.counts.reconnects) == (0, 0)
+# Fault of the emulated server, and what reading says of it; None where frames go on as if there were none.
+FAULTS = {
+    "wrong-length": None,
+    "no-length": None,
+    "dashed-boundary": None,
+    "stall": "has sent nothing for|has stopped sending",
+    "cut": "has closed the stream|sent no newer picture|are broken",
+    "unauthorized": r"\(401\)",
+    "busy": r"\(503\)",
+    "frozen": "repeats the same picture",
+    "no-video": "its input 1 has no video",
+    "refuse": "cannot be reached|broke off|HTTP",
+    "corrupt": "are broken",
+    "resolution": "160x120",
+}
 
 
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        ("stall", "has sent nothing for|has stopped sending"),
-        ("cut", "has closed the stream|sent no newer picture|are broken"),
-        ("unauthorized", r"refuses the user 'root' \(401\)"),
-        ("busy", r"is busy \(503\)"),
-        ("frozen", "repeats the same picture"),
-        ("no-video", "its input 1 has no video"),
-        ("refuse", "cannot be reached|broke off|does not speak HTTP"),
-    ],
-)
-def test_each_fault_is_told_and_recovered_from(emulated, fault, words, monkeypatch):
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_is_told_and_recovered_from(emulated, fault, monkeypatch, capfd):
     monkeypatch.setattr(axis, "FROZEN_S", 0.3)
     monkeypatch.setattr(frame_buffer, "REFUSED_PAUSE_S", 0.3)
+    words = FAULTS[fault]
+    emulated.faults.set(fault, words is None)
     with watching(emulated) as camera:
         emulated.faults.set(fault)
         t, deadline, said = camera.read().t, time.monotonic() + PATIENCE_S, ""
-        while not re.search(words, said):
+        while words is not None and not re.search(words, said):
             assert time.monotonic() < deadline, said
             try:
-                t = camera.read(t, 0.2).t
-            except StaleFrameError as error:
+                t = camera.read(t, 0.01 if fault == "corrupt" else 0.2).t
+            except DeviceError as error:
                 said = str(error)
         assert "\n" not in said
-        emulated.faults.set(fault, False)
-        assert camera.read(t, PATIENCE_S).t > t
-
-
-def test_emulated_damage_is_dropped_and_counted(emulated, capfd):
-    with watching(emulated) as camera:
-        t, deadline = camera.read().t, time.monotonic() + PATIENCE_S
-        emulated.faults.set("corrupt")
-        while camera.counts.refused < 9:
-            with contextlib.suppress(StaleFrameError):
-                t = camera.read(t, 0.2).t
-            assert time.monotonic() < deadline
-        emulated.faults.set("corrupt", False)
-        assert camera.read(t, PATIENCE_S).t > t
-
-
-def test_an_emulated_change_of_resolution(emulated):
-    with watching(emulated) as camera:
-        emulated.faults.set("resolution")
-        server_changes = time.monotonic() + PATIENCE_S
-        with pytest.raises(DeviceError, match="now sends 160x120 where it sent 320x240"):
-            all(camera.read() for _ in iter(lambda: time.monotonic() < server_changes, False))
+        emulated.faults.set(fault, words is None)
+        end = time.monotonic() + PATIENCE_S
+        while True:
+            with contextlib.suppress(DeviceError):
+                t, before = camera.read(t, 0.5).t, t
+                break
+            assert time.monotonic() < end
+        assert t > before
+    assert capfd.readouterr().err == ""

@@ -9,7 +9,7 @@ import pytest
 
 from cotarget.drivers import frame_buffer
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, RefusedError
+from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, StreamRefusedError
 from cotarget.errors import DeviceError, StaleFrameError
 from tests.support.simulated_clock import SimClock
 
@@ -56,7 +56,7 @@ def test_the_newest_frame_is_read_with_the_time_of_its_exposure(bench, encode):
     np.testing.assert_array_equal(frame.image, image(30))
     assert frame.t == pytest.approx(bench.clock.t - LATENCY_S)
     assert bench.read().t == frame.t
-    assert bench.why(frame.t) == "the camera sent no newer picture within 0 s"
+    assert "no newer picture" in bench.why(frame.t)
     assert (bench.frames.counts.frames, bench.frames.counts.skipped) == (3, 2)
 
 
@@ -68,7 +68,7 @@ def test_a_repeated_frame_is_no_new_one(bench, encode):
         assert not bench.put(encode(10))
     assert bench.frames.counts.repeated == 20
     assert bench.frames.frozen_s == pytest.approx(20 * 0.04)
-    assert bench.why(t) == "no new picture for 0.8 s: the camera repeats the same picture"
+    assert "repeats the same picture" in bench.why(t)
     bench.put(encode(11))
     assert bench.read(t).t > t
     assert bench.frames.frozen_s == 0.0
@@ -80,68 +80,66 @@ def test_an_old_frame_is_none():
     bench.clock.t += 0.29
     bench.read()
     bench.clock.t += 0.02
-    assert bench.why(None) == "no new picture for 0.3 s: the camera has sent nothing for 0.3 s"
+    assert "nothing for 0.3 s" in bench.why(None)
 
 
-def test_damaged_frames_are_refused_when_they_are_read_and_the_next_is_taken(bench):
-    bench.put(jpeg(10))
-    t = bench.read().t
-    bench.put(jpeg(20)[:-20])
-    assert bench.why(t) == "no new picture for 0.0 s: the pictures of the camera are broken, 1 so far"
-    bench.frames.refuse(2)
-    assert bench.frames.counts.refused == 3
-    bench.put(jpeg(30))
-    np.testing.assert_array_equal(bench.read(t).image, image(30))
+# What happens after a frame, the reason why no newer one can be read, and how many frames are refused for that.
+REASONS = {
+    "damaged": (lambda bench: bench.put(jpeg(20)[:-20]), "broken", 1),
+    "cut short": (lambda bench: bench.frames.refuse(2), "broken", 2),
+    "late": (lambda bench: bench.put(image(20), took=2 * FRESH_S), "take 1 s to come", 1),
+    "late, and again in time": (
+        lambda bench: (bench.put(image(20), took=2 * FRESH_S), bench.put(image(20))),
+        "take 1 s to come",
+        1,
+    ),
+    "remarked": (lambda bench: bench.frames.remark("its input has no video"), "its input has no video", 0),
+    "lost": (lambda bench: bench.frames.lose(DeviceError("its cable is unplugged")), "unplugged; reconnecting", 0),
+    "nothing": (lambda bench: None, "no newer picture", 0),
+}
 
 
-def test_a_frame_that_took_too_long_is_refused_and_its_repetition_too(bench):
+@pytest.mark.parametrize("name", REASONS)
+def test_reading_says_why_no_newer_frame_comes_until_the_next_one(bench, name):
+    act, reason, refused = REASONS[name]
+    bench.frames.opened()
     bench.put(image(10))
     t = bench.read().t
-    bench.put(image(20), took=2 * FRESH_S)
-    assert bench.why(t) == "no new picture for 0.0 s: its frames take 1 s to come, 1 so far"
-    bench.put(image(20))
-    bench.why(t)
-    bench.put(image(30))
-    assert bench.read(t).t > t
+    act(bench)
+    assert reason in bench.why(t)
+    assert bench.frames.counts.refused == refused
+    bench.frames.opened()
+    bench.put(jpeg(30))
+    np.testing.assert_array_equal(bench.read(t).image, image(30))
+    assert bench.frames.counts.reconnects == 1
+    assert "no newer picture" in bench.why()
+
+
+def test_silence_and_a_remark_are_told_together(bench):
+    bench.put(image(10))
+    bench.frames.remark("its input has no video")
+    bench.clock.t += 0.3
+    said = bench.why()
+    assert "nothing for 0.3 s" in said
+    assert said.endswith("; its input has no video")
+    bench.frames.heard()
+    assert "nothing" not in bench.why()
 
 
 def test_another_size_is_an_error_until_it_is_set_back(bench):
     bench.put(image(10, (64, 48)))
     for _ in range(2):
-        with pytest.raises(DeviceError, match="the camera now sends 64x48 where it sent 32x24: set its resolution"):
+        with pytest.raises(DeviceError, match="64x48 where it sent 32x24"):
             bench.read()
     bench.put(image(10))
     assert bench.read().image.shape == (24, 32, 3)
 
 
-def test_what_else_is_known_is_told_until_the_next_frame(bench):
-    bench.put(image(10))
-    bench.frames.remark("its input has no video")
-    assert bench.why() == "no new picture for 0.0 s: its input has no video"
-    bench.clock.t += 0.3
-    said = "no new picture for 0.3 s: the camera has sent nothing for 0.3 s"
-    assert bench.why() == f"{said}; its input has no video"
-    bench.frames.heard()
-    assert "nothing" not in bench.why()
-    bench.put(image(20))
-    assert "video" not in bench.why()
-
-
-def test_a_lost_camera_says_why_until_it_is_open_again(bench):
-    bench.frames.opened()
-    bench.put(image(10))
-    bench.frames.lose(DeviceError("its cable is unplugged"))
-    assert bench.why() == "no new picture for 0.0 s: its cable is unplugged; reconnecting"
-    bench.frames.opened()
-    assert bench.why() == "the camera sent no newer picture within 0 s"
-    assert bench.frames.counts.reconnects == 1
-
-
 def test_the_first_frame_is_waited_for(bench):
-    with pytest.raises(DeviceError, match=r"the camera has sent no whole picture in 0 s"):
+    with pytest.raises(DeviceError, match="no whole picture"):
         bench.frames.first(0.0)
     bench.put(jpeg(10)[:-20])
-    with pytest.raises(DeviceError, match=r"the pictures of the camera are broken"):
+    with pytest.raises(DeviceError, match="broken"):
         bench.frames.first(0.0)
     bench.put(jpeg(10, (64, 48)))
     assert bench.frames.first(0.0) == (64, 48)  # its owner says what to write
@@ -174,7 +172,7 @@ def test_a_stream_is_opened_again_until_the_buffer_is_closed(monkeypatch):
         frames.read()
 
 
-@pytest.mark.parametrize("error", [RefusedError, DeviceError])
+@pytest.mark.parametrize("error", [StreamRefusedError, DeviceError])
 def test_a_stream_that_cannot_be_opened_is_an_error_at_once(error):
     frames = FrameBuffer("the camera", MonotonicClock(), SIZE, 0.0, PATIENCE_S)
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from cotarget.drivers.gphoto_camera import S5_IS_LENS
-from cotarget.drivers.lens import LensMotion, LensTable
+from cotarget.drivers.lens import LensMotion, LensPositions
 
 PITCH_MM = 0.01794  # 5.74 mm of sensor on 320 px
-S5_IS = LensTable(S5_IS_LENS, tuple(range(129)), PITCH_MM)
+S5_IS = LensPositions(S5_IS_LENS, tuple(range(129)), PITCH_MM)
 ROUNDING = 1e-9
 
 
@@ -42,7 +42,7 @@ def test_beyond_the_lens_is_its_end(focal_px, position):
 
 def test_range_is_that_of_the_positions_that_can_be_commanded():
     assert S5_IS.focal_range == pytest.approx((6.0 / PITCH_MM, 72.0 / PITCH_MM))
-    coarse = LensTable(((0, 10.0), (10, 100.0)), (2, 4, 6, 8), 0.01)
+    coarse = LensPositions(((0, 10.0), (10, 100.0)), (2, 4, 6, 8), 0.01)
     assert coarse.focal_range == pytest.approx((10.0 * 10**0.2 / 0.01, 10.0 * 10**0.8 / 0.01))
     assert [coarse.position_for(mm / 0.01) for mm in (10.0, 10**1.45, 100.0)] == [2, 4, 8]
 

@@ -110,7 +110,6 @@ def test_a_head_that_strays():
     assert watch.strayed(0.25) == 0.25
 
 
-@pytest.mark.slow
 def stalled(settled_s, hang=0):
     return [{"figure": "faults", "fault": "fixed.stall", "way": "held", "outcome": "ended", "settled_s": settled_s,
              "beyond_deg": 0.0, "hang": hang, "traceback": 0, "load": 1.0}]  # fmt: skip

@@ -176,7 +176,7 @@ def test_v010_scene_and_model_make_a_world():
 def test_v010_hardware_rigs_load():
     hardware = load_config(OLD / "rig_hardware.toml").hardware
     found = devices(hardware)
-    head = ("/dev/ttyUSB0", 19200, 0.0514286, (-158.0, 158.0), (-46.0, 31.0), 1, -1, 90.0, 0.05)
+    head = ("/dev/ttyUSB0", 0.0514286, (-158.0, 158.0), (-46.0, 31.0), 1, -1, 90.0, 0.05, 19200)
     assert dataclasses.astuple(found["head"].settings) == head
     fixed = ("http://192.168.0.90", 2, "viewer", "secret", (352, 288), "CIF", 15.0, 20, 0.12)
     assert dataclasses.astuple(found["fixed"].settings) == fixed

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
-from cotarget.errors import DeviceError, StaleFrameError
+from cotarget.errors import StaleFrameError
 from cotarget.sim.devices import SimClock, SimPanTilt, SimStream, SimZoomStream, head_drive, lens_drive
 from cotarget.sim.motion import HISTORY_S, Axis, trapezoid
 
@@ -85,23 +85,6 @@ def test_commands_are_rounded_to_steps_inside_the_limits():
     clock.sleep_until(1e3)
     assert not unit.state().moving
     assert unit.state().pan == pytest.approx(math.radians(-10.0))
-
-
-def test_halt_brakes_short_of_the_goal():
-    unit, clock, drive = head()
-    unit.move(2.0, 0.0)
-    clock.sleep_until(0.3)
-    unit.halt()
-    clock.sleep_until(10.0)
-    assert 0 < drive.angles_at(clock.now())[0] < 1.0
-    assert not unit.state().moving
-
-
-@pytest.mark.parametrize("angles", [(math.nan, 0.0), (0.0, math.inf)])
-def test_a_head_refuses_what_is_not_a_number(angles):
-    unit, *_ = head()
-    with pytest.raises(DeviceError, match="cannot go to"):
-        unit.move(*angles)
 
 
 def stream(**changes):

@@ -1,0 +1,49 @@
+"""A session waits for the person who brings the board, and no longer than that takes."""
+
+from dataclasses import dataclass, replace
+
+from cotarget.calibration.session import CaptureRecorder
+from cotarget.geometry import pose
+from tests.support.synthetic_rig import SyntheticRig
+
+
+@dataclass
+class SlowHands:
+    """Moves the board from the old pose to the requested one within three seconds, as people do."""
+
+    rig: SyntheticRig
+    patience: float = 20.0
+
+    def present(self, T_fixed_board):
+        rig = self.rig
+        old = rig.placed[-1][1]
+        start = T_fixed_board if old is None else old
+        for k in range(1, 61):
+            s = k / 60
+            between = (1 - s) * start.translation + s * T_fixed_board.translation
+            turned = start.rotation * (start.rotation.inv() * T_fixed_board.rotation) ** s
+            rig.placed.append((rig.t + 3 * s, pose(between, turned.as_rotvec(degrees=True))))
+
+
+def started(rig):
+    recorder = CaptureRecorder(rig, rig.board_config)
+    recorder.start()
+    return recorder
+
+
+def test_a_board_in_hands_is_waited_for():
+    rig = SyntheticRig()
+    rig.board = SlowHands(rig)
+    rig.placed.append((0.0, pose([-0.4, -0.25, 3.0], [0, 0, 0])))
+    recorder, begun = started(rig), rig.t
+    recorder.present(pose([-0.1, -0.1, 3.0], [0, 20, 0]))
+    assert 3.0 < rig.t - begun < 6.0
+    assert recorder.see_fixed() is not None
+
+
+def test_a_board_that_nobody_brings_is_not_waited_for_without_end():
+    rig = SyntheticRig()
+    rig.board = replace(rig.board, patience=5.0)
+    recorder, begun = started(rig), rig.t
+    recorder.present(pose([0, 0, -3.0], [0, 0, 0]))
+    assert 5.0 <= rig.t - begun < 7.0

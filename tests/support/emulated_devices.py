@@ -1,0 +1,219 @@
+"""Emulated devices with little behind them, one at a time: a feed of pictures, axes in real time, a lens."""
+
+import contextlib
+import itertools
+import math
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.drivers.ptu_d46 import D46Settings
+from cotarget.emulators.axis_241q import AxisServer
+from cotarget.emulators.faults import Faults
+from cotarget.emulators.plant import Feed, Picture
+from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
+from cotarget.emulators.ptu_d46.unit import D46_STOCK
+from cotarget.emulators.serve import SerialLine, TcpLine
+from cotarget.sim.motion import Axis
+
+DEADLINE_S = 20.0  # of real time: a loaded machine has reached it only if something hangs
+FEED_S = 0.04  # between the pictures of the emulated video server
+FEED_SIZE = (320, 240)
+USER, PASSWORD = "root", "hunter2 & co"
+
+
+# The Axis video server
+
+
+@contextlib.contextmanager
+def axis_server():
+    """A 241Q whose input shows a new picture 25 times a second, each with its number in its first pixels.
+
+    Its ``sent`` has the time at which each picture was sent.
+    """
+    feed, sent, end = Feed(), {}, threading.Event()
+    rng = np.random.default_rng(0)
+    scene = cv2.resize(rng.integers(0, 255, (15, 20, 3), dtype=np.uint8), FEED_SIZE, interpolation=cv2.INTER_CUBIC)
+
+    def publish():
+        for index in itertools.count():
+            image = cv2.add(scene, rng.integers(0, 5, scene.shape, dtype=np.uint8))
+            for bit in range(16):
+                image[:16, 16 * bit : 16 * bit + 16] = 255 * (index >> bit & 1)
+            feed.publish(Picture(image, index, time.monotonic()))
+            if end.wait(FEED_S):
+                return
+
+    publisher = threading.Thread(target=publish, daemon=True)
+    publisher.start()
+    try:
+        with AxisServer({1: feed}, user=USER, password=PASSWORD, sent=sent.__setitem__) as server:
+            server.sent = sent
+            yield server
+    finally:
+        end.set()
+        publisher.join(DEADLINE_S)
+        assert not publisher.is_alive()
+
+
+def picture_number(image):
+    """The number that a picture of `axis_server` has in its first pixels."""
+    return sum(int(image[4:12, 16 * bit + 4 : 16 * bit + 12].mean() > 127) << bit for bit in range(16))
+
+
+# The pan-tilt unit PTU-D46
+
+
+class Plant:
+    """An axis in real time, with the simulation's trapezoids."""
+
+    def __init__(self):
+        self.axis, self.rests, self.lock = Axis(1e6, 1.0), -math.inf, threading.Lock()
+
+    def command(self, goal, speed, acceleration):
+        with self.lock:
+            self.axis.acceleration = acceleration
+            self.rests = self.axis.command(time.monotonic(), goal, speed)
+
+    def halt(self, acceleration):
+        with self.lock:
+            self.axis.acceleration = acceleration
+            self.rests = self.axis.halt(time.monotonic())
+
+    def at(self, t):
+        with self.lock:
+            return self.axis.motor(t)
+
+    def position(self):
+        return round(self.at(time.monotonic())[0])
+
+    def speed(self):
+        return self.at(time.monotonic())[1]
+
+    def moving(self):
+        with self.lock:
+            return time.monotonic() < self.rests
+
+
+class D46Unit:
+    """An emulated unit behind a paced pseudo-terminal or TCP; a context manager.
+
+    Attributes:
+        config: settings of the driver that connects to it, with pan in the unit's own sense.
+    """
+
+    def __init__(self, profile=D46_STOCK, tcp=False):
+        self.pan, self.tilt, self.faults = Plant(), Plant(), Faults(D46_FAULTS)
+        unit = D46(self.pan, self.tilt, profile, self.faults, time.monotonic)
+        self.line = TcpLine(unit) if tcp else SerialLine(unit)
+        step = profile.step / 3600
+        self.config = D46Settings(
+            port=self.line.url if tcp else self.line.port,
+            step_deg=step,
+            pan_deg=tuple(step * end for end in profile.pan),
+            tilt_deg=tuple(step * end for end in profile.tilt),
+            pan_sign=1,
+        )
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.line.close()
+
+    def turning(self):
+        return self.pan.moving() or self.tilt.moving()
+
+
+# The Canon PowerShot S5 IS: in a process of its own, because libgphoto2 would hold up its threads
+
+S5IS = """
+import sys, threading, time
+import numpy as np
+from cotarget.emulators.faults import Faults
+from cotarget.emulators.plant import Feed, Picture
+from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
+
+class Lens:
+    last, at = 128, 0
+    def command(self, position):
+        self.at = position
+    def position(self):
+        return self.at
+    def moving(self):
+        return False
+
+def show(feed, done):
+    index = 0
+    while not done.wait(0.05):
+        index += 1
+        feed.publish(Picture(np.full((480, 640, 3), 20 + index % 200, np.uint8), index, time.monotonic()))
+
+feed, lens, faults, done = Feed(), Lens(), Faults(S5IS_FAULTS), threading.Event()
+still = np.full((2448, 3264, 3), 90, np.uint8)
+threading.Thread(target=show, args=(feed, done), daemon=True).start()
+with S5isServer(feed, lambda: still, lens, faults=faults) as server:
+    print(server.port, flush=True)
+    for line in sys.stdin:
+        if line.strip():
+            name, on = line.split()
+            faults.set(name, on == "on")
+        print(lens.at, flush=True)
+done.set()
+"""
+
+
+class S5isProcess:
+    """The emulated camera's process.
+
+    Attributes:
+        port: port of the camera, as gphoto2 writes it.
+    """
+
+    def __init__(self, process):
+        self._process = process
+        self.port = f"ptpip:localhost:{int(self._line())}"
+
+    def switch(self, fault, on=True):
+        """Switch a fault on or off."""
+        self._ask(f"{fault} {'on' if on else 'off'}")
+
+    def lens(self):
+        """Where the lens is."""
+        return int(self._ask(""))
+
+    def _ask(self, text):
+        print(text, file=self._process.stdin, flush=True)
+        return self._line()
+
+    def _line(self):
+        """Its next line; it is killed if none comes, and its lines end."""
+        late = threading.Timer(DEADLINE_S, self._process.kill)
+        late.start()
+        try:
+            return self._process.stdout.readline()
+        finally:
+            late.cancel()
+            late.join()
+
+
+@contextlib.contextmanager
+def s5is_process():
+    """An emulated S5 IS, whose pictures are even and never the same, and whose stills have 90 grey levels."""
+    pytest.importorskip("gphoto2")
+    path = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", S5IS], env=os.environ | path, **pipes) as process:
+        try:
+            yield S5isProcess(process)
+            process.stdin.close()
+            process.wait(DEADLINE_S)
+        finally:
+            process.kill()
