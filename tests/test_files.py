@@ -1,6 +1,7 @@
 """Results: under their name only when complete, written by one run at a time, and through links."""
 
 import fcntl
+import re
 import signal
 import subprocess
 import sys
@@ -106,16 +107,30 @@ def times_in(path):
         return [frame.t for frame in film]
 
 
+def full_at(path, size, part):
+    """The error of a film for which the disk has room but for a part of its size.
+
+    x264 reads memory that it has not written, by which films of the same frames differ in size by up to 2 %: a film
+    that fitted was smaller, and gives the size for the next.
+    """
+    while True:
+        try:
+            with full_disk(int(part * size)):
+                noisy_film(path, 6)
+        except CotargetError as error:
+            return error
+        size = path.stat().st_size
+
+
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
 def test_a_film_on_a_disk_that_gets_full_can_be_played_up_to_there(tmp_path, suffix):
     whole, path = tmp_path / f"whole{suffix}", tmp_path / f"a{suffix}"
     noisy_film(whole, 6)
     size = whole.stat().st_size
     for part, least, most in ((0.6, 50, 100), (1 - 1e-3, 125, 150)):  # on the way, and when it is completed
-        with full_disk(int(part * size)), pytest.raises(CotargetError, match=rf"a{suffix}: .*{SAID}") as caught:
-            noisy_film(path, 6)
-        said = [str(caught.value), *getattr(caught.value, "__notes__", ())]
-        assert said[-1].endswith("holds what there was until then")
+        error = full_at(path, size, part)
+        assert re.search(rf"a{suffix}: .*{SAID}", str(error))
+        assert [str(error), *getattr(error, "__notes__", ())][-1].endswith("holds what there was until then")
         times = times_in(path)
         assert least <= len(times) <= most
         np.testing.assert_allclose(times, np.arange(len(times)) / 25, atol=1e-3)
