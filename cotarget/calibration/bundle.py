@@ -201,44 +201,26 @@ E3 = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Views through one lens, as arrays.
+    """Views through one lens, as arrays."""
 
-    Attributes:
-        rows: indices of these v views among all, (v,).
-        stop: index of the zoom sample; None for the fixed camera.
-        pan: reported pan [rad], (v,).
-        tilt: reported tilt [rad], (v,).
-        owners: index of each view's board among the model's boards, (v,).
-        observed: corners [px], (v, N, 2); 0 for corners that are not seen.
-        seen: True for corners that are seen, (v, N).
-    """
-
-    rows: npt.NDArray[np.intp]
-    stop: int | None
-    pan: Array
-    tilt: Array
-    owners: npt.NDArray[np.intp]
-    observed: Array
-    seen: npt.NDArray[np.bool_]
+    rows: npt.NDArray[np.intp]  # indices of these v views among all, (v,)
+    stop: int | None  # index of the zoom sample; None for the fixed camera
+    pan: Array  # reported pan [rad], (v,)
+    tilt: Array  # reported tilt [rad], (v,)
+    owners: npt.NDArray[np.intp]  # index of each view's board among the model's boards, (v,)
+    observed: Array  # corners [px], (v, N, 2); 0 for corners that are not seen
+    seen: npt.NDArray[np.bool_]  # True for corners that are seen, (v, N)
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Corners of a batch as a model predicts them, with derivatives.
+    """Corners of a batch as a model predicts them, with derivatives."""
 
-    Attributes:
-        pixels: all corners, (v, N, 2) [px].
-        by_shared: derivatives by the free shared parameters on which the batch depends, (v, N, 2, k).
-        columns: indices of these among all free shared parameters, (k,).
-        by_board: derivatives by the pose of each view's board, (v, N, 2, 6).
-        by_turn: derivatives by the true pan and tilt of each view, (v, N, 2, 2); None for the fixed camera.
-    """
-
-    pixels: Array
-    by_shared: Array
-    columns: npt.NDArray[np.intp]
-    by_board: Array
-    by_turn: Array | None
+    pixels: Array  # all corners, (v, N, 2) [px]
+    by_shared: Array  # derivatives by the free shared parameters on which the batch depends, (v, N, 2, k)
+    columns: npt.NDArray[np.intp]  # indices of these among all free shared parameters, (k,)
+    by_board: Array  # derivatives by the pose of each view's board, (v, N, 2, 6)
+    by_turn: Array | None  # derivatives by the true pan and tilt of each view, (v, N, 2, 2); None for the fixed camera
 
 
 def batches_of(model: BundleModel, views: Sequence[View]) -> list[Batch]:
@@ -412,15 +394,10 @@ TURNS = 2  # pan and tilt
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Gaussian prior of the shared parameters.
+    """Gaussian prior of the shared parameters."""
 
-    Attributes:
-        reference: model with the means.
-        sigmas: standard deviations by parameter name; a parameter without one has no prior.
-    """
-
-    reference: BundleModel
-    sigmas: Mapping[str, float]
+    reference: BundleModel  # model with the means
+    sigmas: Mapping[str, float]  # standard deviations by parameter name; a parameter without one has no prior
 
 
 # Indices of the shared parameters on which a batch depends (k,), and J^T W J of each of its views (v, m, m).
@@ -429,65 +406,38 @@ Gram = tuple[npt.NDArray[np.intp], Array]
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations in blocks.
+    """Normal equations in blocks."""
 
-    Attributes:
-        shared: shared parameters, (n, n).
-        mixed: shared parameters by each board's pose, (B, n, 6).
-        boards: pose of each board, (B, 6, 6).
-        shared_gradient: gradient by the shared parameters, (n,).
-        board_gradient: gradient by each board's pose, (B, 6).
-        squares: weighted sum of squared residuals [px^2].
-    """
-
-    shared: Array
-    mixed: Array
-    boards: Array
-    shared_gradient: Array
-    board_gradient: Array
-    squares: float
+    shared: Array  # shared parameters, (n, n)
+    mixed: Array  # shared parameters by each board's pose, (B, n, 6)
+    boards: Array  # pose of each board, (B, 6, 6)
+    shared_gradient: Array  # gradient by the shared parameters, (n,)
+    board_gradient: Array  # gradient by each board's pose, (B, 6)
+    squares: float  # weighted sum of squared residuals [px^2]
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A model's residuals, batch by batch.
+    """A model's residuals, batch by batch."""
 
-    Attributes:
-        model: the model.
-        predictions: predicted corners of each batch.
-        residuals: predicted minus observed, (v, N, 2) [px]; 0 for corners that are not seen.
-        after: residuals after each view's pan and tilt are fitted within the jitter, (v, N, 2) [px].
-        given: sum of the squared changes of pan and tilt [rad^2].
-        finite: False where a board is behind a camera.
-        sigma: robust standard deviation of a coordinate of ``after`` [px].
-    """
-
-    model: BundleModel
-    predictions: list[Prediction]
-    residuals: list[Array]
-    after: list[Array]
-    given: float
-    finite: bool
-    sigma: float
+    model: BundleModel  # the model
+    predictions: list[Prediction]  # predicted corners of each batch
+    residuals: list[Array]  # predicted minus observed, (v, N, 2) [px]; 0 for corners that are not seen
+    after: list[Array]  # residuals after each view's pan and tilt are fitted within the jitter, (v, N, 2) [px]
+    given: float  # sum of the squared changes of pan and tilt [rad^2]
+    finite: bool  # False where a board is behind a camera
+    sigma: float  # robust standard deviation of a coordinate of ``after`` [px]
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Least-squares problem of one fit.
+    """Least-squares problem of one fit."""
 
-    Attributes:
-        batches: views, grouped by lens.
-        points: the board's corners in its frame [m], (N, 3).
-        free: blocks that are free.
-        prior: prior of the shared parameters, or None.
-        jitter: standard deviation of the head's true angles about the reported ones [rad].
-    """
-
-    batches: list[Batch]
-    points: Array
-    free: tuple[Block, ...]
-    prior: Prior | None
-    jitter: float
+    batches: list[Batch]  # views, grouped by lens
+    points: Array  # the board's corners in its frame [m], (N, 3)
+    free: tuple[Block, ...]  # blocks that are free
+    prior: Prior | None  # prior of the shared parameters, or None
+    jitter: float  # standard deviation of the head's true angles about the reported ones [rad]
 
     def at(self, model: BundleModel) -> Evaluation:
         """Evaluate a model: predict every view and compute the residuals."""
@@ -721,28 +671,18 @@ DAMPING_LIMIT = 1e10
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of a fit.
+    """Result of a fit."""
 
-    Attributes:
-        model: the fitted model.
-        free: blocks that were free.
-        residuals: predicted minus observed corners, (V, N, 2) [px]; nan for corners that are not seen.
-        left: residuals after each view's pan and tilt are fitted within the jitter, (V, N, 2) [px].
-        normal: normal matrix of the free blocks, with the boards' poses and any jitter eliminated; its inverse times
-            ``variance`` is the parameters' covariance.
-        variance: variance of a coordinate [px^2]; None where there are not more coordinates than parameters.
-        jitter: standard deviation of the head's angles that the fit assumed [rad].
-        views: views that were fitted.
-    """
-
-    model: BundleModel
-    free: tuple[Block, ...]
-    residuals: Array
-    left: Array
+    model: BundleModel  # the fitted model
+    free: tuple[Block, ...]  # blocks that were free
+    residuals: Array  # predicted minus observed corners, (V, N, 2) [px]; nan for corners that are not seen
+    left: Array  # residuals after each view's pan and tilt are fitted within the jitter, (V, N, 2) [px]
+    # normal matrix of the free blocks, with the boards' poses and any jitter eliminated; its inverse times
+    # ``variance`` is the parameters' covariance
     normal: Array
-    variance: float | None
-    jitter: float
-    views: tuple[View, ...]
+    variance: float | None  # variance of a coordinate [px^2]; None where there are not more coordinates than parameters
+    jitter: float  # standard deviation of the head's angles that the fit assumed [rad]
+    views: tuple[View, ...]  # views that were fitted
 
     @property
     def rms_px(self) -> float:

@@ -73,17 +73,11 @@ LARGEST_ANGLE = 2 * math.pi  # a head stays within one turn to each side [rad]; 
 
 @dataclass(frozen=True)
 class CaptureIndex:
-    """Content of index.json.
+    """Content of index.json."""
 
-    Attributes:
-        board: the board in the images.
-        pitch_mm: pixel size of the zoom camera [mm], or None.
-        captures: captures with the file's name as their source and an empty image.
-    """
-
-    board: BoardConfig
-    pitch_mm: float | None
-    captures: tuple[Capture, ...]
+    board: BoardConfig  # the board in the images
+    pitch_mm: float | None  # pixel size of the zoom camera [mm], or None
+    captures: tuple[Capture, ...]  # captures with the file's name as their source and an empty image
 
 
 @model

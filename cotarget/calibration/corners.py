@@ -57,19 +57,12 @@ PIXEL_SCALE = 1000.0  # divisor of pixels in the map's fit, so that the columns 
 
 @dataclass(frozen=True)
 class Look:
-    """Distances at which corners are examined, in squares.
+    """Distances at which corners are examined, in squares."""
 
-    Attributes:
-        window: half window of cornerSubPix.
-        inside: distance from the corner along both axes at which the colours of the four squares are compared.
-        near: smaller distance at which they are compared again.
-        sharpness: smallest contrast at ``near`` over that at ``inside``; below it the image is too blurred.
-    """
-
-    window: float
-    inside: float
-    near: float
-    sharpness: float
+    window: float  # half window of cornerSubPix
+    inside: float  # distance from the corner along both axes at which the colours of the four squares are compared
+    near: float  # smaller distance at which they are compared again
+    sharpness: float  # smallest contrast at ``near`` over that at ``inside``; below it the image is too blurred
 
 
 # Refuses a blur of 7 px (one standard deviation) with squares of 70 px.
@@ -80,19 +73,12 @@ SMALL = Look(window=WINDOW_SHARE, inside=0.3, near=0.3, sharpness=0.0)
 
 @dataclass(frozen=True, eq=False)
 class FoundCorners:
-    """Result of a search for corners.
+    """Result of a search for corners."""
 
-    Attributes:
-        corners_px: points found, (N, 2) [px]; nan where nothing was found.
-        seen: True for points that are corners of the grid, (N,).
-        expected: True for corners that were well inside the image and should have been seen, (N,).
-        spacing: smallest distance of neighbouring corners in the image [px].
-    """
-
-    corners_px: Array
-    seen: Mask
-    expected: Mask
-    spacing: float
+    corners_px: Array  # points found, (N, 2) [px]; nan where nothing was found
+    seen: Mask  # True for points that are corners of the grid, (N,)
+    expected: Mask  # True for corners that were well inside the image and should have been seen, (N,)
+    spacing: float  # smallest distance of neighbouring corners in the image [px]
 
     def rounded(self) -> Array:
         """Return the corners that are seen, rounded, (N, 2) [px]; nan for the others."""

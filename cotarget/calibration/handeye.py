@@ -64,44 +64,29 @@ PRIOR = 1 / np.repeat([REGULARIZED_ROTATION, REGULARIZED_POSITION], 3) ** 2
 
 @dataclass(frozen=True, eq=False)
 class HandEyeProblem:
-    """Residuals of n motions or poses as functions of stacked transforms, of which X is the first.
+    """Residuals of n motions or poses as functions of stacked transforms, of which X is the first."""
 
-    Attributes:
-        residuals: function of the transforms; returns residuals (n, 6), rotation [rad] before translation [m], and
-            derivatives by a step (w, d) of every transform, (n, 6, 6 * transforms).
-        groups: number of the group of each of the six residuals, from 0.
-        noise: function of the transforms, the residuals' standard deviations (6,) and the number of motions or poses
-            used; returns the diagonal of the normal matrix of X that noise alone would show, (6,), see `spectrum`.
-        independent: number of independent motions.
-        share: independent motions over all motions; the weight of each.
-    """
-
+    # function of the transforms; returns residuals (n, 6), rotation [rad] before translation [m], and derivatives
+    # by a step (w, d) of every transform, (n, 6, 6 * transforms)
     residuals: Callable[[RigidTransform], tuple[Array, Array]]
-    groups: tuple[int, ...]
+    groups: tuple[int, ...]  # number of the group of each of the six residuals, from 0
+    # function of the transforms, the residuals' standard deviations (6,) and the number of motions or poses used;
+    # returns the diagonal of the normal matrix of X that noise alone would show, (6,), see `spectrum`
     noise: Callable[[RigidTransform, Array, int], Array]
-    independent: int
-    share: float = 1.0
+    independent: int  # number of independent motions
+    share: float = 1.0  # independent motions over all motions; the weight of each
 
 
 @dataclass(frozen=True, eq=False)
 class MotionFit:
-    """Optimum of a hand-eye problem.
+    """Optimum of a hand-eye problem."""
 
-    Attributes:
-        transforms: stacked transforms, X first.
-        residuals: residuals at the optimum, (n, 6) [rad and m].
-        normal: normal matrix of X with the other transforms eliminated, in inverse variances, (6, 6).
-        noise: diagonal of the part of it that noise alone would show, (6,).
-        used: False for gross errors, (n,).
-        covariance: covariance of X, (6, 6), with the prior of the free directions where X is regularized.
-    """
-
-    transforms: RigidTransform
-    residuals: Array
-    normal: Array
-    noise: Array
-    used: npt.NDArray[np.bool_]
-    covariance: Array
+    transforms: RigidTransform  # stacked transforms, X first
+    residuals: Array  # residuals at the optimum, (n, 6) [rad and m]
+    normal: Array  # normal matrix of X with the other transforms eliminated, in inverse variances, (6, 6)
+    noise: Array  # diagonal of the part of it that noise alone would show, (6,)
+    used: npt.NDArray[np.bool_]  # False for gross errors, (n,)
+    covariance: Array  # covariance of X, (6, 6), with the prior of the free directions where X is regularized
 
 
 def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> HandEyeProblem:

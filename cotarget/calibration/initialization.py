@@ -174,21 +174,13 @@ def _misfit(model: BundleModel, number: int, T: RigidTransform, views: Sequence[
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Result of calibrating each camera by itself.
+    """Result of calibrating each camera by itself."""
 
-    Attributes:
-        model: model with both cameras' intrinsics.
-        fixed_fit: fit of the fixed camera.
-        zoom_fit: fit of the zoom camera.
-        views: views used.
-        rejected: views left out.
-    """
-
-    model: BundleModel
-    fixed_fit: Fit
-    zoom_fit: Fit
-    views: tuple[View, ...]
-    rejected: tuple[Rejected, ...]
+    model: BundleModel  # model with both cameras' intrinsics
+    fixed_fit: Fit  # fit of the fixed camera
+    zoom_fit: Fit  # fit of the zoom camera
+    views: tuple[View, ...]  # views used
+    rejected: tuple[Rejected, ...]  # views left out
 
     @property
     def has_head(self) -> bool:

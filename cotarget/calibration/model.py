@@ -209,19 +209,14 @@ class HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class BundleModel:
-    """Parameters of a bundle adjustment: the rig's geometry and the boards, which predict the corners of every view.
+    """Parameters of a bundle adjustment: the rig's geometry and the boards, which predict the corners of every view."""
 
-    Attributes:
-        boards: T_fixed_board by the number of the placement.
-        fixed: fixed camera.
-        zoom_head: zoom camera on its head; None while only the fixed camera is modelled. Its T_head_zoom is the
-            identity until it is estimated, and where the head never moves.
-        warp: height of the board's middle above its edges, towards its z, by the bend along x and along y [m].
-    """
-
-    boards: Mapping[int, RigidTransform]
-    fixed: FixedCamera
+    boards: Mapping[int, RigidTransform]  # T_fixed_board by the number of the placement
+    fixed: FixedCamera  # fixed camera
+    # zoom camera on its head; None while only the fixed camera is modelled. Its T_head_zoom is the identity until
+    # it is estimated, and where the head never moves.
     zoom_head: ZoomHead | None = None
+    # height of the board's middle above its edges, towards its z, by the bend along x and along y [m]
     warp: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -257,25 +252,15 @@ class BundleModel:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Result of a calibration method.
+    """Result of a calibration method."""
 
-    Attributes:
-        model: fitted model, with the board of every placement.
-        residuals: residuals of its parts.
-        views: views that it used.
-        has_head: False if the head never moved, so that T is unknown.
-        covariance: covariance of the parameters, or None.
-        jitter: standard deviation of the head's true angles about the reported ones [rad].
-        held_out: result of the held-out check, or None.
-    """
-
-    model: BundleModel
-    residuals: Residuals
-    views: tuple[View, ...]
-    has_head: bool
-    covariance: Covariance | None = None
-    jitter: float = 0.0
-    held_out: HeldOut | None = None
+    model: BundleModel  # fitted model, with the board of every placement
+    residuals: Residuals  # residuals of its parts
+    views: tuple[View, ...]  # views that it used
+    has_head: bool  # False if the head never moved, so that T is unknown
+    covariance: Covariance | None = None  # covariance of the parameters, or None
+    jitter: float = 0.0  # standard deviation of the head's true angles about the reported ones [rad]
+    held_out: HeldOut | None = None  # result of the held-out check, or None
 
 
 def stop_of(nominal_px: Sequence[float], view: View) -> int:

@@ -80,16 +80,11 @@ class Observability:
 
 @dataclass(frozen=True, eq=False)
 class HandMotions:
-    """Motions of the hand, as the verdict describes them.
+    """Motions of the hand, as the verdict describes them."""
 
-    Attributes:
-        turns: rotation vectors in the hand's frame [rad], (n, 3).
-        shifts: translations in the hand's frame [m], (n, 3).
-        turns_base: rotation vectors in the base's frame [rad], (n, 3); None where only motions are known.
-    """
-
-    turns: Array
-    shifts: Array
+    turns: Array  # rotation vectors in the hand's frame [rad], (n, 3)
+    shifts: Array  # translations in the hand's frame [m], (n, 3)
+    # rotation vectors in the base's frame [rad], (n, 3); None where only motions are known
     turns_base: Array | None = None
 
 

@@ -33,21 +33,13 @@ BORDER = 0.02  # border that the grid keeps clear, as a share of the image
 
 @dataclass(frozen=True, eq=False)
 class PredictedAccuracy:
-    """Normal matrix of the parameters so far, and the dependence of the pointing error on them.
+    """Normal matrix of the parameters so far, and the dependence of the pointing error on them."""
 
-    Attributes:
-        model: model fitted so far.
-        free: its free blocks.
-        normal: normal matrix of the parameters, (n, n) [1/px^2].
-        variance: variance of a corner coordinate [px^2].
-        pointing: mean over targets of J^T J, with J the derivative of the pointing error by the parameters, (n, n).
-    """
-
-    model: BundleModel
-    free: tuple[Block, ...]
-    normal: Array
-    variance: float
-    pointing: Array
+    model: BundleModel  # model fitted so far
+    free: tuple[Block, ...]  # its free blocks
+    normal: Array  # normal matrix of the parameters, (n, n) [1/px^2]
+    variance: float  # variance of a corner coordinate [px^2]
+    pointing: Array  # mean over targets of J^T J, with J the derivative of the pointing error by the parameters, (n, n)
 
     def error(self, more: Array | float = 0.0) -> float:
         """Predict the rms pointing error [rad] with the normal matrix of further views; infinite if undetermined."""
@@ -122,17 +114,12 @@ SMALLEST_SPACING_PX = {"chessboard": 7.0, "charuco": 14.0}  # mean over the boar
 
 @dataclass(eq=False)
 class Coverage:
-    """Corners seen in each cell of one camera's image, and boards that the camera did not see.
+    """Corners seen in each cell of one camera's image, and boards that the camera did not see."""
 
-    Attributes:
-        size: image size (width, height) [px].
-        counts: number of corners in every cell, `GRID`.
-        misses: middle in the image [px], (2,), and depth [m] of each board that was not seen, such as one behind a wall
-            or below a floor; boards there at that depth or farther will not be seen either.
-    """
-
-    size: tuple[int, int]
-    counts: Array = field(default_factory=lambda: np.zeros(GRID))
+    size: tuple[int, int]  # image size (width, height) [px]
+    counts: Array = field(default_factory=lambda: np.zeros(GRID))  # number of corners in every cell, `GRID`
+    # middle in the image [px], (2,), and depth [m] of each board that was not seen, such as one behind a wall or
+    # below a floor; boards there at that depth or farther will not be seen either
     misses: list[tuple[Array, float]] = field(default_factory=list)
 
     def add(self, corners_px: Array) -> None:

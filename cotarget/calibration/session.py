@@ -94,23 +94,14 @@ Seen = TypeVar("Seen")
 
 @dataclass(eq=False)
 class CaptureRecorder:
-    """Move head, lens and board, take images, and keep captures and views.
+    """Move head, lens and board, take images, and keep captures and views."""
 
-    Attributes:
-        rig: the rig.
-        board: the board in use.
-        directory: folder for the captures; None to keep the corners only.
-        views: views found so far.
-        rejected: images in which a board was expected but not found.
-        number: number of the present placement.
-    """
-
-    rig: Rig
-    board: BoardConfig
-    directory: Path | None = None
-    views: list[View] = field(default_factory=list)
-    rejected: list[Rejected] = field(default_factory=list)
-    number: int = -1
+    rig: Rig  # the rig
+    board: BoardConfig  # the board in use
+    directory: Path | None = None  # folder for the captures; None to keep the corners only
+    views: list[View] = field(default_factory=list)  # views found so far
+    rejected: list[Rejected] = field(default_factory=list)  # images in which a board was expected but not found
+    number: int = -1  # number of the present placement
     _captures: list[Capture] = field(default_factory=list)
     _still_since: float = 0.0
     _wish: tuple[float, float] | None = None

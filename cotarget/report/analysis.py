@@ -37,21 +37,13 @@ CURVES = ("ratio_x", "ratio_y", "cx", "cy", "kappa1", "pupil_mm")
 
 @dataclass(frozen=True, eq=False)
 class LensCurves:
-    """Parameters of the zoom lens as curves over the nominal focal length, by the names of `CURVES`.
+    """Parameters of the zoom lens as curves over the nominal focal length, by the names of `CURVES`."""
 
-    Attributes:
-        nominal_px: nominal focal lengths of the curves, (n,) [px].
-        stops_px: nominal focal lengths of the zoom samples [px].
-        values: values of each curve, (n,).
-        sigmas: standard deviations of each curve, (n,); empty without a covariance.
-        at_stops: values at the zoom samples.
-    """
-
-    nominal_px: Array
-    stops_px: tuple[float, ...]
-    values: dict[str, Array]
-    sigmas: dict[str, Array]
-    at_stops: dict[str, Array]
+    nominal_px: Array  # nominal focal lengths of the curves, (n,) [px]
+    stops_px: tuple[float, ...]  # nominal focal lengths of the zoom samples [px]
+    values: dict[str, Array]  # values of each curve, (n,)
+    sigmas: dict[str, Array]  # standard deviations of each curve, (n,); empty without a covariance
+    at_stops: dict[str, Array]  # values at the zoom samples
 
 
 def lens_curves(calibration: Calibration) -> LensCurves:
@@ -124,17 +116,11 @@ JITTER_GROUP = "the head's jitter"
 
 @dataclass(frozen=True)
 class AtFocal:
-    """Predicted pointing error at one focal length, rms over the fixed image and the depths.
+    """Predicted pointing error at one focal length, rms over the fixed image and the depths."""
 
-    Attributes:
-        nominal_px: nominal focal length [px].
-        focal_px: true focal length, the mean of both directions [px].
-        rms: predicted pointing error [rad].
-    """
-
-    nominal_px: float
-    focal_px: float
-    rms: float
+    nominal_px: float  # nominal focal length [px]
+    focal_px: float  # true focal length, the mean of both directions [px]
+    rms: float  # predicted pointing error [rad]
 
     @property
     def rms_px(self) -> float:
@@ -319,17 +305,11 @@ ROWS, COLUMNS = ("upper", "", "lower"), ("left", "", "right")
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """All corners that one camera saw.
+    """All corners that one camera saw."""
 
-    Attributes:
-        size: image size (width, height) [px].
-        seen_px: corners in the image, (n, 2) [px].
-        residuals: predicted minus seen, (n, 2) [px], after each view's pan and tilt are fitted within the jitter.
-    """
-
-    size: tuple[int, int]
-    seen_px: Array
-    residuals: Array
+    size: tuple[int, int]  # image size (width, height) [px]
+    seen_px: Array  # corners in the image, (n, 2) [px]
+    residuals: Array  # predicted minus seen, (n, 2) [px], after each view's pan and tilt are fitted within the jitter
 
     @property
     def sigma(self) -> float:
@@ -339,30 +319,20 @@ class Corners:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Residuals averaged over the cells of an image; nan where a cell has too few.
+    """Residuals averaged over the cells of an image; nan where a cell has too few."""
 
-    Attributes:
-        middles: mean of the corners in each cell, (cells, 2) [px].
-        means: mean of their residuals, (cells, 2) [px].
-        beyond_chance: True for means larger than noise explains, (cells,).
-    """
-
-    middles: Array
-    means: Array
-    beyond_chance: npt.NDArray[np.bool_]
+    middles: Array  # mean of the corners in each cell, (cells, 2) [px]
+    means: Array  # mean of their residuals, (cells, 2) [px]
+    beyond_chance: npt.NDArray[np.bool_]  # True for means larger than noise explains, (cells,)
 
 
 @dataclass(frozen=True, eq=False)
 class BoardShape:
-    """Deviation of the board's corners from their nominal positions, estimated from the residuals.
+    """Deviation of the board's corners from their nominal positions, estimated from the residuals."""
 
-    Attributes:
-        offsets: offset of every corner along x, y and z of the board [m], (N, 3); 0 for a corner that is hardly seen.
-        beyond_chance: True for offsets larger than noise explains, (N,).
-    """
-
+    # offset of every corner along x, y and z of the board [m], (N, 3); 0 for a corner that is hardly seen
     offsets: Array
-    beyond_chance: npt.NDArray[np.bool_]
+    beyond_chance: npt.NDArray[np.bool_]  # True for offsets larger than noise explains, (N,)
 
     @property
     def wrong(self) -> bool:
@@ -382,23 +352,14 @@ class BoardShape:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Evidence from the stored corners.
+    """Evidence from the stored corners."""
 
-    Attributes:
-        views: views used.
-        corners: corners of both cameras.
-        distances: distance of each placement's middle from the fixed camera [m].
-        leanings: angle of each placement from facing the fixed camera [rad].
-        per_stop: number of views at each zoom sample.
-        shape: deviation of the board's corners.
-    """
-
-    views: tuple[View, ...]
-    corners: dict[CameraName, Corners]
-    distances: Array
-    leanings: Array
-    per_stop: tuple[int, ...]
-    shape: BoardShape
+    views: tuple[View, ...]  # views used
+    corners: dict[CameraName, Corners]  # corners of both cameras
+    distances: Array  # distance of each placement's middle from the fixed camera [m]
+    leanings: Array  # angle of each placement from facing the fixed camera [rad]
+    per_stop: tuple[int, ...]  # number of views at each zoom sample
+    shape: BoardShape  # deviation of the board's corners
 
 
 def gather(calibration: Calibration) -> Evidence | None:

@@ -130,21 +130,13 @@ def focal_figure(stops: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Fi
 
 @dataclass(frozen=True)
 class Plot:
-    """Rendered figure for the page and for the folder beside it.
+    """Rendered figure for the page and for the folder beside it."""
 
-    Attributes:
-        name: name of its file without suffix.
-        png: figure as PNG.
-        svg: figure as SVG, which the page then embeds; None if it embeds the PNG.
-        alt: text alternative.
-        caption: caption.
-    """
-
-    name: str
-    png: bytes
-    svg: bytes | None
-    alt: str
-    caption: str
+    name: str  # name of its file without suffix
+    png: bytes  # figure as PNG
+    svg: bytes | None  # figure as SVG, which the page then embeds; None if it embeds the PNG
+    alt: str  # text alternative
+    caption: str  # caption
 
     @property
     def data_uri(self) -> str:
