@@ -204,7 +204,7 @@ def emulate_command(options: argparse.Namespace) -> None:
         with previous_kept(options.write):
             write_atomically(options.write, emulation.rig_toml(tcp=options.tcp, beside=beside).encode())
         print(
-            f"head     {emulation.tty.port} and {emulation.tcp.url}\n"
+            f"head     {emulation.head.port} and {emulation.head.url}\n"
             f"fixed    {emulation.fixed.url}/mjpg/video.mjpg\n"
             f"zoom     ptpip:{options.host}:{emulation.zoom.port}:{emulation.zoom.port}\n"
             f"board    socket://{options.host}:{emulation.board.port}\n"

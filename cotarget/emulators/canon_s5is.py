@@ -9,9 +9,10 @@ settings are stored and have no effect.
 Behaviour that was not measured on a real camera is chosen so that a driver for this emulator expects little:
 
 - Zoom positions beyond the lens's last are digital: they are accepted, the lens stays at its last, nothing is cropped.
-- The zoom reads back as commanded, even while the lens moves, and may be set during a motion. - The viewfinder gives
-each image once and waits for the next. It answers "busy" during a still, and after a second without an image. - The
-lens stays out when the camera leaves shooting mode.
+- The zoom reads back as commanded, even while the lens moves, and may be set during a motion.
+- The viewfinder gives each image once and waits for the next. It answers "busy" during a still, and after a second
+  without an image.
+- The lens stays out when the camera leaves shooting mode.
 
 Faults of USB are not emulated: PTP/IP is another transport.
 """
@@ -23,12 +24,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from types import TracebackType
-
-import cv2
 
 from cotarget.emulators.faults import Faults
-from cotarget.emulators.plant import Feed, LensPlant
+from cotarget.emulators.plant import Feed, LensPlant, encode_jpeg
 from cotarget.emulators.ptpip import (
     ARRAY,
     LINE_FAULTS,
@@ -50,6 +48,7 @@ from cotarget.emulators.ptpip import (
     encode,
     storage_info,
 )
+from cotarget.emulators.serve import LOCAL
 from cotarget.errors import CotargetError
 from cotarget.rig import Image
 
@@ -59,7 +58,7 @@ log = logging.getLogger(__name__)
 
 THUMB_SIZE = (160, 120)  # px
 PICTURE_WAIT_S = 1.0  # time limit for the viewfinder's next image [s]
-SLICE_S = 0.1  # period of checking whether to go on waiting [s]
+SLICE_S = 0.1  # period of checking whether the viewfinder is still on [s]
 
 
 @dataclass(frozen=True)
@@ -78,11 +77,10 @@ class Viewfinder:
         feed: of images.
         size: (width, height) of the viewfinder [px].
         quality: of JPEG, 1 to 100.
-        closing: set when waits must end.
     """
 
-    def __init__(self, feed: Feed, size: tuple[int, int], quality: int, closing: threading.Event) -> None:
-        self._feed, self._size, self._quality, self._closing = feed, size, quality, closing
+    def __init__(self, feed: Feed, size: tuple[int, int], quality: int) -> None:
+        self._feed, self._size, self._quality = feed, size, quality
         self._seen = -1  # index of the last image given
         self._since: float | None = None
 
@@ -98,13 +96,12 @@ class Viewfinder:
     def image(self) -> bytes | None:
         """Wait for an image exposed since the viewfinder is on and not given yet; None if none comes."""
         deadline = time.monotonic() + PICTURE_WAIT_S
-        while (since := self._since) is not None and time.monotonic() < deadline and not self._closing.is_set():
+        while (since := self._since) is not None and time.monotonic() < deadline:
             picture = self._feed.newest(self._seen, SLICE_S)
             if picture is not None:
                 self._seen = picture.index
                 if picture.t >= since:
-                    scaled = cv2.resize(picture.image, self._size, interpolation=cv2.INTER_AREA)
-                    return jpeg(scaled, self._quality)
+                    return encode_jpeg(picture.image, self._quality, self._size)
         return None
 
 
@@ -112,58 +109,36 @@ class Shutter:
     """Take stills, each on a thread of its own.
 
     Args:
-        source: takes a full-size image now, or a feed of such images.
+        still: takes a full-size image now.
         quality: of JPEG, 1 to 100.
         delay_s: from the request to the exposure [s].
-        closing: set when stills are not needed any more.
     """
 
-    def __init__(
-        self, source: Callable[[], Image] | Feed, quality: int, delay_s: float, closing: threading.Event
-    ) -> None:
-        self._source, self._quality, self._delay_s, self._closing = source, quality, delay_s, closing
-        self._threads: list[threading.Thread] = []
+    def __init__(self, still: Callable[[], Image], quality: int, delay_s: float) -> None:
+        self._still, self._quality, self._delay_s = still, quality, delay_s
+        self._timers: list[threading.Timer] = []
 
     def release(self, done: Callable[[Exposure | None], None]) -> None:
         """Take a still, and call ``done`` with it, or with None if none could be taken."""
-        self._threads = [thread for thread in self._threads if thread.is_alive()]
-        self._threads.append(threading.Thread(target=self._run, args=(done,), daemon=True))
-        self._threads[-1].start()
+        timer = threading.Timer(self._delay_s, self._take, (done,))
+        self._timers = [*(other for other in self._timers if other.is_alive()), timer]
+        timer.start()
 
-    def join(self) -> None:
-        """Wait for the threads, after ``closing`` is set."""
-        for thread in self._threads:
-            thread.join()
+    def close(self) -> None:
+        """Wait for the stills under way, and drop those whose delay is not over."""
+        for timer in self._timers:
+            timer.cancel()
+            timer.join()
 
-    def _run(self, done: Callable[[Exposure | None], None]) -> None:
-        if self._closing.wait(self._delay_s):
-            return
+    def _take(self, done: Callable[[Exposure | None], None]) -> None:
         try:
-            image = self._wait(self._source) if isinstance(self._source, Feed) else self._source()
+            image = self._still()
         except CotargetError as error:
             log.warning("no still: %s", error)
-            image = None
-        if image is None:
             done(None)
             return
-        thumb = cv2.resize(image, THUMB_SIZE, interpolation=cv2.INTER_AREA)
-        size = (image.shape[1], image.shape[0])
-        done(Exposure(jpeg(image, self._quality), size, jpeg(thumb, self._quality)))
-
-    def _wait(self, feed: Feed) -> Image | None:
-        opened, seen = time.monotonic(), -1
-        while not self._closing.is_set():
-            picture = feed.newest(seen, SLICE_S)
-            if picture is not None:
-                if picture.t >= opened:
-                    return picture.image
-                seen = picture.index
-        return None
-
-
-def jpeg(image: Image, quality: int) -> bytes:
-    """Encode an image as JPEG."""
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        jpeg, thumb = encode_jpeg(image, self._quality), encode_jpeg(image, self._quality, THUMB_SIZE)
+        done(Exposure(jpeg, (image.shape[1], image.shape[0]), thumb))
 
 
 # Operations
@@ -180,7 +155,14 @@ CAPTURE, VIEWFINDER_IMAGE, FOCUS_LOCK, FOCUS_UNLOCK = 0x901A, 0x901D, 0x9014, 0x
 SHOOTING_ONLY = frozenset((VIEWFINDER_ON, VIEWFINDER_OFF, CAPTURE, VIEWFINDER_IMAGE, FOCUS_LOCK, FOCUS_UNLOCK))
 # Operations that a busy camera refuses; queries and events still work.
 NOT_WHEN_BUSY = SHOOTING_ONLY | {SET_VALUE, RESET_VALUE, START_SHOOTING, END_SHOOTING}
-OK = Answer()
+
+
+class CodeError(Exception):
+    """An operation is refused with a response code."""
+
+    def __init__(self, code: int, *parameters: int) -> None:
+        super().__init__(f"{code:#06x}")
+        self.answer = Answer(code, parameters)
 
 
 class S5isCamera:
@@ -191,63 +173,72 @@ class S5isCamera:
         shutter: stills.
         lens: zoom.
         faults: active faults, of which this class uses "busy".
+        interrupt: sends an event's code and parameters to the initiator at once.
     """
 
-    def __init__(self, viewfinder: Viewfinder, shutter: Shutter, lens: LensPlant, faults: Faults) -> None:
+    def __init__(
+        self,
+        viewfinder: Viewfinder,
+        shutter: Shutter,
+        lens: LensPlant,
+        faults: Faults,
+        interrupt: Callable[[int, Iterable[int]], None],
+    ) -> None:
         self._viewfinder, self._shutter, self._lens, self._faults = viewfinder, shutter, lens, faults
-        self._interrupt: Callable[[int, Iterable[int]], None] = lambda code, parameters: None
+        self._interrupt = interrupt
         self._lock = threading.RLock()
         self._playing = {prop.code: prop for prop in ALWAYS}
         self._all = self._playing | {prop.code: prop for prop in shooting(lens.last)}
         self._handle = FIRST_HANDLE
         self._reset()
         self._values[ZOOM] = lens.position()
-        self._operations: dict[int, Callable[[tuple[int, ...], bytes], Answer]] = {
-            0x1004: lambda words, data: Answer(data=array([MEMORY], UINT32)),  # storages
-            0x1005: self._storage,
-            0x1006: lambda words, data: Answer(parameters=(0,)),  # objects; stills in memory are not listed
-            0x1007: lambda words, data: Answer(data=array([], UINT32)),
-            0x1008: lambda words, data: self._of_still(words[0], self._still_info),
-            0x1009: lambda words, data: self._of_still(words[0], lambda still: still.jpeg),
-            0x100A: lambda words, data: self._of_still(words[0], lambda still: still.thumb),
-            0x100B: self._delete,
-            0x1014: self._describe,
-            0x1015: self._value,
-            SET_VALUE: self._set,
-            RESET_VALUE: self._set_default,
-            0x101B: self._part,
+        # Operations that return data.
+        self._data: dict[int, Callable[[tuple[int, ...]], bytes]] = {
+            0x1004: lambda words: array([MEMORY], UINT32),  # storages
+            0x1005: lambda words: storage_info("V"),
+            0x1007: lambda words: array([], UINT32),  # objects; stills in memory are not listed
+            0x1008: lambda words: self._still_info(words[0]),
+            0x1009: lambda words: self._still(words[0])[1].jpeg,
+            0x100A: lambda words: self._still(words[0])[1].thumb,
+            0x1014: lambda words: self._property(words[0]).describe(self._values[words[0]]),
+            0x1015: lambda words: encode(self._property(words[0]).kind, self._values[words[0]]),
+            0x101B: lambda words: self._still(words[0])[1].jpeg[words[1] :][: words[2]],
+            0x9013: lambda words: self._events.popleft() if self._events else b"",
+        }
+        # Operations that change something, with the initiator's data.
+        self._actions: dict[int, Callable[[tuple[int, ...], bytes], None]] = {
+            OPEN: lambda words, data: self._open(words[0]),
+            CLOSE: lambda words, data: self.disconnected(),
+            SET_VALUE: lambda words, data: self._set(words[0], data),
+            RESET_VALUE: lambda words, data: self._set(words[0], None),
             START_SHOOTING: lambda words, data: self._shoot(True),
             END_SHOOTING: lambda words, data: self._shoot(False),
-            VIEWFINDER_ON: lambda words, data: self._look(True),
-            VIEWFINDER_OFF: lambda words, data: self._look(False),
-            0x9013: lambda words, data: Answer(data=self._events.popleft() if self._events else b""),
-            FOCUS_LOCK: lambda words, data: OK,
-            FOCUS_UNLOCK: lambda words, data: OK,
-            CAPTURE: self._capture,
+            VIEWFINDER_ON: lambda words, data: self._viewfinder.switch(True),
+            VIEWFINDER_OFF: lambda words, data: self._viewfinder.switch(False),
+            FOCUS_LOCK: lambda words, data: None,
+            FOCUS_UNLOCK: lambda words, data: None,
+            CAPTURE: lambda words, data: self._capture(),
         }
-
-    def interrupt_by(self, send_event: Callable[[int, Iterable[int]], None]) -> None:
-        """Set the function that sends an event's code and parameters to the initiator at once."""
-        self._interrupt = send_event
 
     def operate(self, code: int, parameters: tuple[int, ...], data: bytes) -> Answer:
         """Carry out an operation, with five parameters and its data."""
         with self._lock:
             if code == INFO:
                 return Answer(data=self._info())
-            if code == OPEN:
-                return self._open(parameters[0])
-            if not self._session:
+            if not self._session and code != OPEN:
                 return Answer(Code.SESSION_NOT_OPEN)
-            if code == CLOSE:
-                self.disconnected()
-                return OK
             if code in NOT_WHEN_BUSY and (self._exposure is not None or "busy" in self._faults):
                 return Answer(Code.DEVICE_BUSY)
             if code in SHOOTING_ONLY and not self._shooting:
                 return Answer(REFUSED)
-            if code in self._operations:
-                return self._operations[code](parameters, data)
+            try:
+                if code in self._data:
+                    return Answer(data=self._data[code](parameters))
+                if code in self._actions:
+                    self._actions[code](parameters, data)
+                    return Answer()
+            except CodeError as error:
+                return error.answer
         if code == VIEWFINDER_IMAGE:  # waits outside of the lock, so that a power-off is not delayed
             image = self._viewfinder.image()
             return Answer(Code.DEVICE_BUSY) if image is None else Answer(parameters=(len(image),), data=image)
@@ -257,7 +248,7 @@ class S5isCamera:
         """Close the session; the camera stays in shooting mode, with its viewfinder off."""
         with self._lock:
             self._session = 0
-            self._look(False)
+            self._viewfinder.switch(False)
 
     def unplugged(self) -> None:
         """Go back to play mode, as a camera does without a computer."""
@@ -274,95 +265,66 @@ class S5isCamera:
     def _reset(self) -> None:
         self._session = 0
         self._shooting = False
-        self._look(False)
+        self._viewfinder.switch(False)
         self._exposure: object | None = None  # marks the still under way
         self._taken: tuple[int, Exposure, str] | None = None  # handle, still, date
         self._events: deque[bytes] = deque()
-        self._clock_offset = 0  # seconds by which the initiator set the clock
         self._values: dict[int, Value] = {code: prop.default for code, prop in self._all.items()}
-
-    def _properties(self) -> dict[int, Property]:
-        return self._all if self._shooting else self._playing
+        self._values[UNIX_TIME] = int(time.time())
 
     def _info(self) -> bytes:
-        codes = tuple(self._properties())
+        codes = tuple(self._all if self._shooting else self._playing)
         return DeviceInfo(EXTENSION, OPERATIONS, EVENTS, codes, FORMATS, MAKER, MODEL, VERSION, SERIAL).pack()
 
-    def _open(self, session: int) -> Answer:
+    def _open(self, session: int) -> None:
         if self._session:
-            return Answer(Code.SESSION_ALREADY_OPEN, (self._session,))
+            raise CodeError(Code.SESSION_ALREADY_OPEN, self._session)
         if session == 0:
-            return Answer(Code.INVALID_PARAMETER)
+            raise CodeError(Code.INVALID_PARAMETER)
         self._session = session
         self._events.clear()
-        return OK
 
-    def _storage(self, words: tuple[int, ...], _: bytes) -> Answer:
-        return Answer(data=storage_info("V")) if words[0] == MEMORY else Answer(Code.INVALID_STORAGE)
-
-    def _describe(self, words: tuple[int, ...], _: bytes) -> Answer:
-        prop = self._properties().get(words[0])
-        return Answer(Code.PROPERTY_NOT_SUPPORTED) if prop is None else Answer(data=prop.describe(self._now(prop)))
-
-    def _value(self, words: tuple[int, ...], _: bytes) -> Answer:
-        prop = self._properties().get(words[0])
-        return Answer(Code.PROPERTY_NOT_SUPPORTED) if prop is None else Answer(data=encode(prop.kind, self._now(prop)))
-
-    def _now(self, prop: Property) -> Value:
-        return int(time.time()) + self._clock_offset if prop.code == UNIX_TIME else self._values[prop.code]
-
-    def _set(self, words: tuple[int, ...], data: bytes) -> Answer:
-        prop = self._properties().get(words[0])
+    def _property(self, code: int) -> Property:
+        prop = (self._all if self._shooting else self._playing).get(code)
         if prop is None:
-            return Answer(Code.PROPERTY_NOT_SUPPORTED)
+            raise CodeError(Code.PROPERTY_NOT_SUPPORTED)
+        return prop
+
+    def _set(self, code: int, data: bytes | None) -> None:
+        """Set a property to a coded value, or to its default."""
+        prop = self._property(code)
         if not prop.writable:
-            return Answer(Code.ACCESS_DENIED)
+            raise CodeError(Code.ACCESS_DENIED)
         try:
-            value = decode(prop.kind, data)
+            value = prop.default if data is None else decode(prop.kind, data)
         except PtpError:
-            return Answer(Code.INVALID_PROPERTY_FORMAT)
-        return self._assign(prop, value) if prop.allows(value) else Answer(Code.INVALID_PROPERTY_VALUE)
-
-    def _set_default(self, words: tuple[int, ...], _: bytes) -> Answer:
-        prop = self._properties().get(words[0])
-        if prop is None:
-            return Answer(Code.PROPERTY_NOT_SUPPORTED)
-        return self._assign(prop, prop.default) if prop.writable else Answer(Code.ACCESS_DENIED)
-
-    def _assign(self, prop: Property, value: Value) -> Answer:
-        self._values[prop.code] = value
-        if prop.code == UNIX_TIME and isinstance(value, int):
-            self._clock_offset = value - int(time.time())
-        if prop.code == ZOOM and isinstance(value, int):
+            raise CodeError(Code.INVALID_PROPERTY_FORMAT) from None
+        if data is not None and not prop.allows(value):
+            raise CodeError(Code.INVALID_PROPERTY_VALUE)
+        self._values[code] = value
+        if code == ZOOM and isinstance(value, int):
             self._lens.command(min(value, self._lens.last))
-        return OK
 
-    def _shoot(self, on: bool) -> Answer:
+    def _shoot(self, on: bool) -> None:
         if on == self._shooting:
-            return Answer(ALREADY_SO)
+            raise CodeError(ALREADY_SO)
         self._shooting = on
-        self._look(False)
+        self._viewfinder.switch(False)
         self._happen(MODE_CHANGED)
-        return OK
 
-    def _look(self, on: bool) -> Answer:
-        self._viewfinder.switch(on)
-        return OK
-
-    def _capture(self, _: tuple[int, ...], __: bytes) -> Answer:
+    def _capture(self) -> None:
         # The viewfinder is off until the still is taken: its next image is exposed after it.
         live = self._viewfinder.on
-        self._look(False)
+        self._viewfinder.switch(False)
         exposure = self._exposure = object()
         self._shutter.release(lambda taken: self._keep(exposure, taken, live))
-        return OK
 
     def _keep(self, exposure: object, taken: Exposure | None, live: bool) -> None:
         with self._lock:
             if exposure is not self._exposure:  # the camera was switched off meanwhile
                 return
             self._exposure = None
-            self._look(live and bool(self._session))
+            self._viewfinder.switch(live and bool(self._session))
             if taken is not None:
                 self._handle += 1
                 self._taken = self._handle, taken, time.strftime("%Y%m%dT%H%M%S")
@@ -378,25 +340,15 @@ class S5isCamera:
         if mode in INTERRUPTING:
             self._interrupt(code, parameters)
 
-    def _of_still(self, handle: int, part: Callable[[Exposure], bytes]) -> Answer:
+    def _still(self, handle: int) -> tuple[int, Exposure, str]:
         if self._taken is None or self._taken[0] != handle:
-            return Answer(Code.INVALID_HANDLE)
-        return Answer(data=part(self._taken[1]))
+            raise CodeError(Code.INVALID_HANDLE)
+        return self._taken
 
-    def _still_info(self, still: Exposure) -> bytes:
-        assert self._taken is not None
-        name = f"IMG_{self._handle - FIRST_HANDLE:04d}.JPG"
-        date = self._taken[2]
+    def _still_info(self, handle: int) -> bytes:
+        _, still, date = self._still(handle)
+        name = f"IMG_{handle - FIRST_HANDLE:04d}.JPG"
         return ObjectInfo(MEMORY, len(still.jpeg), still.size, len(still.thumb), THUMB_SIZE, name, date).pack()
-
-    def _part(self, words: tuple[int, ...], _: bytes) -> Answer:
-        answer = self._of_still(words[0], lambda still: still.jpeg[words[1] :][: words[2]])
-        return answer if answer.data is None else Answer(parameters=(len(answer.data),), data=answer.data)
-
-    def _delete(self, words: tuple[int, ...], _: bytes) -> Answer:
-        answer = self._of_still(words[0], lambda still: b"")
-        self._taken = None if answer.data is not None else self._taken
-        return Answer(answer.code)
 
 
 # Tables of operations, events and properties
@@ -498,12 +450,12 @@ S5IS_FAULTS = (*LINE_FAULTS, "busy", "gone", "power-off")
 GUID = bytes.fromhex("00000000000010008000000085c50148")
 
 
-class S5isServer:
+class S5isServer(PtpIpServer):
     """The emulated camera on a TCP port, for one initiator at a time; a context manager.
 
     Args:
         preview: images of the viewfinder.
-        still: takes a full-size image now, or a feed of such images.
+        still: takes a full-size image now.
         lens: the zoom.
         host: address to listen at.
         port: to listen at; 0 for any free port.
@@ -519,48 +471,33 @@ class S5isServer:
     def __init__(
         self,
         preview: Feed,
-        still: Callable[[], Image] | Feed,
+        still: Callable[[], Image],
         lens: LensPlant,
         *,
-        host: str = "127.0.0.1",
+        host: str = LOCAL,
         port: int = 0,
         preview_size: tuple[int, int] = (320, 240),
         quality: int = 90,
         faults: Faults | None = None,
         shutter_s: float = 0.4,
     ) -> None:
-        self._faults = Faults(S5IS_FAULTS) if faults is None else faults
-        self._closing = threading.Event()
-        self._shutter = Shutter(still, quality, shutter_s, self._closing)
-        viewfinder = Viewfinder(preview, preview_size, quality, self._closing)
-        self._camera = S5isCamera(viewfinder, self._shutter, lens, self._faults)
-        self._server = PtpIpServer(self._camera, GUID, MODEL, self._faults, self._absent, host, port)
-        self._camera.interrupt_by(self._server.send_event)
-
-    @property
-    def port(self) -> int:
-        """TCP port of the server."""
-        return self._server.port
+        self.faults = Faults(S5IS_FAULTS) if faults is None else faults
+        self._viewfinder = Viewfinder(preview, preview_size, quality)
+        self._shutter = Shutter(still, quality, shutter_s)
+        self._camera = S5isCamera(self._viewfinder, self._shutter, lens, self.faults, self.send_event)
+        super().__init__(self._camera, GUID, MODEL, self.faults, self._is_absent, host, port)
 
     def close(self) -> None:
         """Close the connections and end every thread."""
-        self._closing.set()
-        self._server.close()
-        self._shutter.join()
+        self._viewfinder.switch(False)
+        super().close()
+        self._shutter.close()
 
-    def _absent(self) -> bool:
-        if "power-off" in self._faults:
+    def _is_absent(self) -> bool:
+        if "power-off" in self.faults:
             self._camera.switch_off()
             return True
-        if "gone" in self._faults:
+        if "gone" in self.faults:
             self._camera.unplugged()
             return True
         return False
-
-    def __enter__(self) -> "S5isServer":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

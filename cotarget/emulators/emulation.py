@@ -13,9 +13,9 @@ from cotarget.config import DEFAULT_TARGETS, RigConfig
 from cotarget.emulators.axis_241q import AXIS_FAULTS, AxisServer
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
 from cotarget.emulators.faults import Faults
-from cotarget.emulators.ptu_d46.firmware import D46_FAULTS, make_twins
+from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import UnitProfile
-from cotarget.emulators.serve import JsonLines, SerialLine, TcpLine
+from cotarget.emulators.serve import LOCAL, JsonLines, UnitPorts
 from cotarget.emulators.world import LiveWorld
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose
@@ -23,7 +23,6 @@ from cotarget.geometry import RigidTransform, pose
 PREVIEW_SHARE = 2  # the viewfinder's images are smaller than stills by this factor
 QUALITY = 90  # of JPEG, as the simulated cameras have by default
 PAN_SIGN = -1  # positive pan turns left, as in the D46's manual
-LOCAL = "127.0.0.1"
 FAULTS: Mapping[str, tuple[str, ...]] = {"head": D46_FAULTS, "fixed": AXIS_FAULTS, "zoom": S5IS_FAULTS}
 COPIED = ("board", "safety", "targets")  # tables of the simulated rig's file that also hold for the emulated one
 
@@ -77,11 +76,9 @@ class Emulation:
         width, height = (side // PREVIEW_SHARE for side in sim.zoom.size)
         self.preview_size = width, height
         with contextlib.ExitStack() as opened:
-            self.world = opened.enter_context(LiveWorld(config, pan_sign=PAN_SIGN))
-            world = self.world
-            twins = make_twins(world.pan, world.tilt, unit, self.faults["head"], world.clock.now)
-            self.tty = opened.enter_context(SerialLine(twins[0]))
-            self.tcp = opened.enter_context(TcpLine(twins[1], ports.host, ports.head, paced=True, beside=self.tty))
+            world = self.world = opened.enter_context(LiveWorld(config, pan_sign=PAN_SIGN))
+            firmware = D46(world.pan, world.tilt, unit, self.faults["head"], world.clock.now)
+            self.head = opened.enter_context(UnitPorts(firmware, tcp=ports.head, host=ports.host))
             self.fixed = opened.enter_context(
                 AxisServer(
                     {1: world.feeds["fixed"]},
@@ -107,7 +104,6 @@ class Emulation:
             )
             self.board = opened.enter_context(JsonLines(self._hold, ports.host, ports.board))
             self.control = opened.enter_context(JsonLines(self._control, ports.host, ports.control))
-            self._host = ports.host
             self._opened = opened.pop_all()
 
     def rig_toml(self, *, tcp: bool = False, beside: Mapping[str, Any] | None = None) -> str:
@@ -123,7 +119,7 @@ class Emulation:
         last = sim.zoom.lens_steps - 1
         hardware: dict[str, Any] = {
             "head": {
-                "port": self.tcp.url if tcp else self.tty.port,
+                "port": self.head.url if tcp else self.head.port,
                 "step_deg": sim.head.step_deg,
                 "pan_deg": list(sim.head.pan_deg),
                 "tilt_deg": list(sim.head.tilt_deg),
@@ -140,7 +136,7 @@ class Emulation:
             }
             | ({"user": self._user} if self._user else {}),
             "zoom": {
-                "port": f"ptpip:{self._host}:{self.zoom.port}:{self.zoom.port}",
+                "port": f"ptpip:{self.zoom.host}:{self.zoom.port}:{self.zoom.port}",
                 "lens": [[0, sim.zoom.focal_mm[0]], [last, sim.zoom.focal_mm[1]]],
                 "lens_speed": sim.zoom.lens_speed,
                 "size": list(self.preview_size),
@@ -150,7 +146,7 @@ class Emulation:
                 "latency_s": sim.zoom.latency_s if late else 0.0,
                 "command_delay_s": delay,
             },
-            "board": {"presenter": f"socket://{self._host}:{self.board.port}"},
+            "board": {"presenter": f"socket://{self.board.host}:{self.board.port}"},
         }
         board = dataclasses.asdict(self.config.board)
         tables = {"backend": "hardware", "hardware": hardware, **(beside or {}), "board": board}
@@ -203,7 +199,7 @@ class Emulation:
                 "tilt_deg": math.degrees(tilt),
                 "moving": self.world.pan.moving() or self.world.tilt.moving(),
                 "lens": self.world.lens.position(),
-                "port": self.tty.port,
+                "port": self.head.port,
             }
         self.switch(str(said["fault"]), bool(said.get("on", True)))
         return {"ok": True}

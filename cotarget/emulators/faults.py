@@ -18,11 +18,6 @@ class Faults:
         self._active = set[str]()  # no annotation: the method set hides the type
         self._changed = threading.Condition()
 
-    @property
-    def known(self) -> frozenset[str]:
-        """Names of all faults that the device has."""
-        return self._known
-
     def set(self, name: str, on: bool = True) -> None:
         """Switch a fault on or off.
 
@@ -43,7 +38,6 @@ class Faults:
 
     def take(self, name: str) -> bool:
         """Return whether a fault is on, and switch it off: for faults that happen once."""
-        assert name in self._known, name
         with self._changed:
             on = name in self._active
             self._active.discard(name)

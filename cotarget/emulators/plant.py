@@ -1,4 +1,4 @@
-"""Interfaces between the emulated devices and the simulated rig: image feeds, axes, a lens.
+"""Interfaces between the emulated devices and the simulated rig: images and their feeds, axes, a lens.
 
 All are safe from any thread. The simulated world runs in `cotarget.emulators.world`; tests use prepared images and
 their own axes.
@@ -8,6 +8,8 @@ import threading
 import time
 from dataclasses import dataclass
 from typing import Protocol
+
+import cv2
 
 from cotarget.rig import Image
 
@@ -25,6 +27,19 @@ class Picture:
     image: Image
     index: int
     t: float
+
+
+def encode_jpeg(image: Image, quality: int, size: tuple[int, int] | None = None) -> bytes:
+    """Encode an image as JPEG, scaled to a size by averaging areas.
+
+    Args:
+        image: (H, W, 3) BGR.
+        quality: 0 to 100.
+        size: (width, height) [px], of any aspect ratio; None for the image's own.
+    """
+    if size is not None and size != image.shape[1::-1]:
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 class Feed:

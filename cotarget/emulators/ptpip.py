@@ -1,10 +1,9 @@
 """PTP/IP responder: an emulated device on one TCP port, for one initiator at a time.
 
-The first part encodes PTP's values and datasets (ISO 15740). The second parses and encodes the packets of PTP/IP (CIPA
+The first part encodes PTP's values and datasets (ISO 15740). The second splits and encodes the packets of PTP/IP (CIPA
 DC-005): length of the whole packet (4 bytes), kind (4 bytes) and body, all little-endian. `CommandSession` turns
-packets into packets, and `PtpIpServer` holds the sockets, the threads and the faults of the line. With "hung" nothing
-is answered, with "slow" answers are a second late, "cut" breaks the connection once in the middle of data. While the
-device is ``absent``, the port is closed.
+packets into packets, and `PtpIpServer` holds the connections and the faults of the line. With "hung" nothing is
+answered, with "slow" answers are a second late, "cut" breaks the connection once in the middle of data.
 """
 
 import contextlib
@@ -18,7 +17,8 @@ from enum import IntEnum
 from typing import Protocol
 
 from cotarget.emulators.faults import Faults
-from cotarget.errors import CotargetError, DeviceError
+from cotarget.emulators.serve import TcpServer
+from cotarget.errors import CotargetError
 
 # PTP: values, datasets and response codes
 
@@ -37,11 +37,9 @@ class Code(IntEnum):
     """Response codes of PTP."""
 
     OK = 0x2001
-    GENERAL_ERROR = 0x2002
     SESSION_NOT_OPEN = 0x2003
     OPERATION_NOT_SUPPORTED = 0x2005
     INCOMPLETE_TRANSFER = 0x2007
-    INVALID_STORAGE = 0x2008
     INVALID_HANDLE = 0x2009
     PROPERTY_NOT_SUPPORTED = 0x200A
     ACCESS_DENIED = 0x200F
@@ -230,8 +228,8 @@ class ObjectInfo:
 HEADER = struct.Struct("<II")
 LONGEST_PACKET = 1 << 20  # bytes; initiators send data in pieces of 64 KiB or less
 PIECE = 1 << 16  # bytes of data in one packet of the responder
-GUID_LENGTH = 16
 VERSION = 0x00010000  # of PTP/IP: 1.0
+NO_TRANSACTION = 0xFFFFFFFF
 
 
 class Kind(IntEnum):
@@ -253,115 +251,39 @@ class Kind(IntEnum):
     PROBE_RESPONSE = 14
 
 
-@dataclass(frozen=True)
-class InitCommand:
-    """First packet of a command connection: GUID and name of the initiator."""
-
-    guid: bytes
-    name: str
+Packet = tuple[int, bytes]  # kind and body
 
 
-@dataclass(frozen=True)
-class InitEvent:
-    """First packet of an event connection: number of the command connection that it belongs to."""
-
-    connection: int
-
-
-@dataclass(frozen=True)
-class OperationRequest:
-    """Request of an operation; with ``sends_data`` its data follow."""
-
-    code: int
-    transaction: int
-    parameters: tuple[int, ...]
-    sends_data: bool = False
-
-
-@dataclass(frozen=True)
-class StartData:
-    """Announcement of ``total`` bytes of data."""
-
-    transaction: int
-    total: int
-
-
-@dataclass(frozen=True)
-class Data:
-    """A piece of data; ``last`` marks the last one."""
-
-    transaction: int
-    data: bytes
-    last: bool
-
-
-@dataclass(frozen=True)
-class Cancel:
-    """Cancellation of a transaction."""
-
-    transaction: int
-
-
-@dataclass(frozen=True)
-class Probe:
-    """Query whether the other side is still there, or with ``answer`` the answer to it."""
-
-    answer: bool = False
-
-
-Packet = InitCommand | InitEvent | OperationRequest | StartData | Data | Cancel | Probe
-
-
-class PacketReader:
-    """Splitter of a stream of bytes into the packets that an initiator may send."""
-
-    def __init__(self) -> None:
-        self._pending = bytearray()
-
-    def feed(self, data: bytes) -> Iterator[Packet]:
-        """Add bytes, and yield each packet that they complete.
-
-        Raises:
-            PtpError: the bytes are no packets of an initiator.
-        """
-        self._pending += data
-        while len(self._pending) >= HEADER.size:
-            length, kind = HEADER.unpack_from(self._pending)
-            if not HEADER.size <= length <= LONGEST_PACKET:
-                raise PtpError(f"PTP/IP: a packet cannot be {length} bytes long")
-            if len(self._pending) < length:
-                return
-            body = bytes(self._pending[HEADER.size : length])
-            del self._pending[:length]
-            yield parse_packet(kind, body)
-
-
-def parse_packet(kind: int, body: bytes) -> Packet:
-    """Parse a packet of an initiator.
+def split(pieces: Iterable[bytes]) -> Iterator[Packet]:
+    """Split a stream of bytes into packets, and yield each as soon as it is complete.
 
     Raises:
-        PtpError: an initiator sends no such packet.
+        PtpError: the bytes are no packets.
     """
-    match kind, len(body):
-        case Kind.INIT_COMMAND, length if length >= GUID_LENGTH + 6 and length % 2 == 0:
-            name = body[GUID_LENGTH:-4].decode("utf-16-le", "replace")
-            return InitCommand(body[:GUID_LENGTH], name.partition("\0")[0])
-        case Kind.INIT_EVENT, 4:
-            return InitEvent(*struct.unpack("<I", body))
-        case Kind.REQUEST, length if 10 <= length <= 10 + 4 * PARAMETERS and length % 4 == 2:
-            phase, code, transaction, *parameters = struct.unpack(f"<IHI{(length - 10) // 4}I", body)
-            return OperationRequest(code, transaction, tuple(parameters), sends_data=phase == 2)
-        case Kind.START_DATA, 12:
-            return StartData(*struct.unpack("<IQ", body))
-        case ((Kind.DATA | Kind.END_DATA), length) if length >= 4:
-            return Data(int.from_bytes(body[:4], "little"), body[4:], last=kind == Kind.END_DATA)
-        case Kind.CANCEL, 4:
-            return Cancel(*struct.unpack("<I", body))
-        case Kind.PROBE_REQUEST, 0:
-            return Probe()
-        case Kind.PROBE_RESPONSE, 0:
-            return Probe(answer=True)
-    raise PtpError(f"PTP/IP: no initiator sends a packet of kind {kind} with {len(body)} bytes")
+    pending = bytearray()
+    for piece in pieces:
+        pending += piece
+        while len(pending) >= HEADER.size:
+            length, kind = HEADER.unpack_from(pending)
+            if not HEADER.size <= length <= LONGEST_PACKET:
+                raise PtpError(f"PTP/IP: a packet cannot be {length} bytes long")
+            if len(pending) < length:
+                break
+            body = bytes(pending[HEADER.size : length])
+            del pending[:length]
+            yield kind, body
+
+
+def unpack(layout: str, body: bytes) -> tuple[int, ...]:
+    """Unpack a body of a packet, little-endian.
+
+    Raises:
+        PtpError: the body has another length.
+    """
+    try:
+        return struct.unpack(f"<{layout}", body)
+    except struct.error:
+        raise PtpError(f"PTP/IP: {len(body)} bytes are no such packet") from None
 
 
 def packet(kind: Kind, body: bytes = b"") -> bytes:
@@ -380,16 +302,10 @@ def init_fail(reason: int) -> bytes:
     return packet(Kind.INIT_FAIL, struct.pack("<I", reason))
 
 
-def response(code: int, transaction: int, parameters: Iterable[int] = ()) -> bytes:
-    """Encode the end of a transaction."""
+def response(code: int, transaction: int, parameters: Iterable[int] = (), kind: Kind = Kind.RESPONSE) -> bytes:
+    """Encode the end of a transaction, or an event."""
     words = tuple(parameters)
-    return packet(Kind.RESPONSE, struct.pack(f"<HI{len(words)}I", code, transaction, *words))
-
-
-def event(code: int, parameters: Iterable[int] = ()) -> bytes:
-    """Encode an event of no transaction, for the event connection."""
-    words = tuple(parameters)
-    return packet(Kind.EVENT, struct.pack(f"<HI{len(words)}I", code, 0xFFFFFFFF, *words))
+    return packet(kind, struct.pack(f"<HI{len(words)}I", code, transaction, *words))
 
 
 def data_phase(transaction: int, data: bytes) -> Iterator[bytes]:
@@ -405,15 +321,14 @@ def data_phase(transaction: int, data: bytes) -> Iterator[bytes]:
 # The responder
 
 LINE_FAULTS = ("hung", "slow", "cut")
-LOOK_S = 0.05  # period of checking whether the device is absent [s]
 SLOW_S = 1.0  # delay of a slow answer; libgphoto2 waits for 2.5 s [s]
 SUCCESSION_S = 1.0  # time limit for a new initiator to wait for the end of the one before [s]
 RECEIVE = 1 << 16  # bytes
 LONGEST_DATA = 1 << 20  # most data of an operation; a property's value takes a few bytes [bytes]
+SENDS_DATA = 2  # in the data phase field of a request
 # libgphoto2 sends a request and its data separately and without TCP_NODELAY. Unless the first is acknowledged at once,
 # which is an option of Linux, the second leaves 40 ms late.
 QUICK_ACK: int | None = getattr(socket, "TCP_QUICKACK", None)
-HIGHEST_PORT = 65535
 REJECTED, BUSY = 1, 2  # reasons of INIT_FAIL
 
 
@@ -427,54 +342,55 @@ class CommandSession:
 
     def __init__(self, device: PtpDevice, deaf: Callable[[], bool] = lambda: False) -> None:
         self._device, self._deaf = device, deaf
-        self._request: OperationRequest | None = None  # the operation whose data are incomplete
+        self._code, self._transaction, self._parameters = 0, 0, (0,) * PARAMETERS  # of the latest request
+        self._waits = False  # whether the request's data are incomplete
         self._total = -1  # announced bytes of its data; -1 before the announcement
-        self._data = bytearray()
+        self._data = b""
 
-    def receive(self, received: Packet) -> list[bytes]:
+    def receive(self, kind: int, body: bytes) -> list[bytes]:
         """Process a packet of the initiator; return the packets to send back.
 
         Raises:
-            PtpError: the packet comes out of turn.
+            PtpError: the packet is malformed or comes out of turn.
         """
-        waiting = self._request
-        match received:
-            case OperationRequest() if waiting is None:
-                if not received.sends_data:
-                    return self._operate(received, b"")
-                self._request, self._total, self._data = received, -1, bytearray()
-            case StartData() if waiting is not None and self._total < 0 and received.transaction == waiting.transaction:
-                if received.total > LONGEST_DATA:
-                    raise PtpError(f"PTP/IP: {received.total} bytes are too much data")
-                self._total = received.total
-            case Data() if waiting is not None and self._total >= 0 and received.transaction == waiting.transaction:
-                self._data += received.data
-                if len(self._data) > self._total:
-                    raise PtpError(f"PTP/IP: more data came than the {self._total} bytes announced")
-                if received.last:
-                    return self._complete(waiting)
-            case Probe(answer=False):
+        match kind:
+            case Kind.REQUEST if not self._waits:
+                count = min(max(len(body) - 10, 0) // 4, PARAMETERS)
+                phase, self._code, self._transaction, *parameters = unpack(f"IHI{count}I", body)
+                self._parameters = (*parameters, *(0,) * (PARAMETERS - count))
+                self._waits, self._total, self._data = phase == SENDS_DATA, -1, b""
+                return [] if self._waits else self._operate()
+            case Kind.START_DATA if self._waits and self._total < 0:
+                transaction, self._total = unpack("IQ", body)
+                if transaction != self._transaction or self._total > LONGEST_DATA:
+                    raise PtpError(f"PTP/IP: {self._total} bytes are too much data, or another transaction's")
+            case Kind.DATA | Kind.END_DATA if self._waits and self._total >= 0:
+                (transaction,) = unpack("I", body[:4])
+                self._data += body[4:]
+                if transaction != self._transaction or len(self._data) > self._total:
+                    raise PtpError(f"PTP/IP: more data than {self._total} bytes, or another transaction's")
+                if kind == Kind.END_DATA:
+                    self._waits = False
+                    if len(self._data) < self._total:
+                        return [response(Code.INCOMPLETE_TRANSFER, transaction)]
+                    return self._operate()
+            case Kind.PROBE_REQUEST if not body:
                 return [packet(Kind.PROBE_RESPONSE)]
-            case OperationRequest() | StartData() | Data() | InitCommand() | InitEvent():
-                raise PtpError(f"PTP/IP: a packet out of turn: {type(received).__name__}")
+            case Kind.PROBE_RESPONSE | Kind.CANCEL:
+                pass
+            case _:
+                raise PtpError(f"PTP/IP: a packet out of turn: kind {kind} with {len(body)} bytes")
         return []
 
-    def _complete(self, request: OperationRequest) -> list[bytes]:
-        self._request = None
-        if len(self._data) < self._total:
-            return [response(Code.INCOMPLETE_TRANSFER, request.transaction)]
-        return self._operate(request, bytes(self._data))
-
-    def _operate(self, request: OperationRequest, data: bytes) -> list[bytes]:
+    def _operate(self) -> list[bytes]:
         if self._deaf():
             return []
-        missing = PARAMETERS - len(request.parameters)
-        answer = self._device.operate(request.code, request.parameters + (0,) * missing, data)
-        phase: Iterable[bytes] = () if answer.data is None else data_phase(request.transaction, answer.data)
-        return [*phase, response(answer.code, request.transaction, answer.parameters)]
+        answer = self._device.operate(self._code, self._parameters, self._data)
+        phase: Iterable[bytes] = () if answer.data is None else data_phase(self._transaction, answer.data)
+        return [*phase, response(answer.code, self._transaction, answer.parameters)]
 
 
-class PtpIpServer:
+class PtpIpServer(TcpServer):
     """Server of command and event connections on one port, for one initiator at a time.
 
     Args:
@@ -482,7 +398,7 @@ class PtpIpServer:
         guid: 16 bytes that identify the device.
         name: name of the device.
         faults: must know `LINE_FAULTS`.
-        absent: returns whether the device is unplugged or off now; called every `LOOK_S`.
+        absent: returns whether the device is unplugged or off now, which closes the port.
         host: address to listen at.
         port: to listen at; 0 for any free port.
 
@@ -500,105 +416,38 @@ class PtpIpServer:
         host: str,
         port: int,
     ) -> None:
-        self._device, self._guid, self._name = device, guid, name
-        self._faults, self._absent = faults, absent
-        if not 0 <= port <= HIGHEST_PORT:
-            raise DeviceError(f"cannot listen on {host}:{port}: a port is a number from 0 to {HIGHEST_PORT}")
-        try:
-            self._listener: socket.socket | None = listen(host, port)
-        except OSError as error:
-            raise DeviceError(f"cannot listen on {host}:{port}: {error.strerror or error}") from None
-        self._address: tuple[str, int] = self._listener.getsockname()[:2]
-        self._closing = threading.Event()
+        self._device, self._guid, self._name, self._faults = device, guid, name, faults
         self._numbers = itertools.count(1)
         self._changed = threading.Condition()  # guards the attributes below
-        self._open: set[socket.socket] = set()
         self._caller: int | None = None  # number of the command connection
         self._ears: dict[int, socket.socket] = {}  # event connections by the number of their command connection
-        self._threads: list[threading.Thread] = []
-        self._acceptor = threading.Thread(target=self._accept, daemon=True)
-        self._acceptor.start()
-
-    @property
-    def port(self) -> int:
-        """TCP port of the server."""
-        return self._address[1]
+        super().__init__(self._converse, host, port, absent)
 
     def send_event(self, code: int, parameters: Iterable[int]) -> None:
         """Send an event to the initiator, if it has an event connection."""
         with self._changed:
             ear = None if self._caller is None else self._ears.get(self._caller)
         if ear is not None and "hung" not in self._faults:
-            with contextlib.suppress(OSError):
-                ear.sendall(event(code, parameters))
+            with contextlib.suppress(OSError):  # the initiator is gone
+                ear.sendall(response(code, NO_TRANSACTION, parameters, Kind.EVENT))
 
-    def close(self) -> None:
-        """Close the port and the connections, and wait for the threads."""
-        self._closing.set()
-        self._acceptor.join()
-        self._hang_up()
-        for thread in self._threads:
-            thread.join()
+    def _converse(self, connection: socket.socket) -> None:
+        with contextlib.suppress(PtpError):
+            packets = split(self._pieces(connection))
+            match next(packets, None):
+                case Kind.INIT_COMMAND, _:
+                    self._command(connection, packets)
+                case Kind.INIT_EVENT, body:
+                    self._events(connection, packets, *unpack("I", body))
 
-    def _accept(self) -> None:
-        while not self._closing.is_set():
-            if self._absent():
-                self._hang_up()
-                self._closing.wait(LOOK_S)
-            elif self._listener is None:
-                try:
-                    self._listener = listen(*self._address)
-                except OSError:  # another program has the port for now
-                    self._closing.wait(LOOK_S)
-            else:
-                with contextlib.suppress(TimeoutError):
-                    self._welcome(self._listener.accept()[0])
-        self._stop_listening()
-
-    def _welcome(self, connection: socket.socket) -> None:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.settimeout(None)
-        with self._changed:
-            self._open.add(connection)
-        self._threads = [thread for thread in self._threads if thread.is_alive()]
-        self._threads.append(threading.Thread(target=self._serve, args=(connection,), daemon=True))
-        self._threads[-1].start()
-
-    def _stop_listening(self) -> None:
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-
-    def _hang_up(self) -> None:
-        self._stop_listening()
-        with self._changed:
-            for connection in self._open:
-                with contextlib.suppress(OSError):
-                    connection.shutdown(socket.SHUT_RDWR)
-
-    def _serve(self, connection: socket.socket) -> None:
-        try:
-            with contextlib.suppress(OSError, PtpError):
-                packets = self._packets(connection)
-                match next(packets, None):
-                    case InitCommand():
-                        self._command(connection, packets)
-                    case InitEvent(number):
-                        self._events(connection, packets, number)
-        finally:
-            with self._changed:
-                self._open.discard(connection)
-            connection.close()
-
-    def _packets(self, connection: socket.socket) -> Iterator[Packet]:
-        reader = PacketReader()
+    def _pieces(self, connection: socket.socket) -> Iterator[bytes]:
         while True:
             if QUICK_ACK is not None:
                 connection.setsockopt(socket.IPPROTO_TCP, QUICK_ACK, 1)
             received = connection.recv(RECEIVE)
             if not received:
                 return
-            yield from reader.feed(received)
+            yield received
 
     def _command(self, connection: socket.socket, packets: Iterator[Packet]) -> None:
         number = next(self._numbers)
@@ -611,8 +460,8 @@ class PtpIpServer:
         try:
             self._send(connection, [init_command_ack(number, self._guid, self._name)])
             session = CommandSession(self._device, lambda: "hung" in self._faults)
-            for received in packets:
-                self._send(connection, session.receive(received))
+            for kind, body in packets:
+                self._send(connection, session.receive(kind, body))
         finally:
             self._device.disconnected()
             with self._changed:
@@ -629,8 +478,8 @@ class PtpIpServer:
             return
         try:
             self._send(connection, [packet(Kind.INIT_EVENT_ACK)])
-            for received in packets:
-                if received == Probe():
+            for kind, _ in packets:
+                if kind == Kind.PROBE_REQUEST:
                     self._send(connection, [packet(Kind.PROBE_RESPONSE)])
         finally:
             with self._changed:
@@ -640,17 +489,9 @@ class PtpIpServer:
         if not packets or "hung" in self._faults:
             return
         if "slow" in self._faults:
-            self._closing.wait(SLOW_S)
+            self.closing.wait(SLOW_S)
         answer = b"".join(packets)
         if len(packets) > 1 and self._faults.take("cut"):
             connection.sendall(answer[: len(answer) // 2])
             raise PtpError("PTP/IP: cut")
         connection.sendall(answer)
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """Open a listening socket whose accept() waits `LOOK_S` at most."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.create_server((host, port), family=family)
-    listener.settimeout(LOOK_S)
-    return listener

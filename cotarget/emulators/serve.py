@@ -1,12 +1,10 @@
-"""Transports of emulated devices: a pseudo-terminal as a serial port, a TCP port, and a server of JSON lines.
+"""Transports of emulated devices: TCP servers, JSON lines, and the ports of a unit on a serial line.
 
-`SerialLine` and `TcpLine` serve an emulated unit, each with one firmware on one thread; a unit on both lines needs two
-firmwares in front of the same axes. `Wire` gives every byte its time on the line, ten bits at the baud rate, in each
-direction. Times are planned ahead of the clock, so that a thread that wakes late does not slow the line. `JsonLines`
-answers one JSON object a line, for the board and for the control port.
+`TcpServer` serves each connection on a thread of its own. `UnitPorts` serves a firmware on a pseudo-terminal, on TCP or
+on both, by one thread. `Wire` gives every byte its time on the serial line, ten bits at the baud rate, in each
+direction. Times are planned ahead of the clock, so that a thread that wakes late does not slow the line.
 """
 
-import abc
 import contextlib
 import fcntl
 import json
@@ -14,28 +12,174 @@ import os
 import random
 import select
 import socket
-import socketserver
 import termios
 import threading
 import time
 import tty
 from collections import deque
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 from cotarget.emulators.faults import Faults
-from cotarget.errors import ConfigError, CotargetError, DeviceError
+from cotarget.errors import CotargetError, DeviceError
 
-# Bytes on the wire
+LOCAL, HIGHEST_PORT = "127.0.0.1", 65535
 
-BITS = 10  # per byte: start, eight, stop
-# Most bytes under way to the firmware; beyond that the sender must wait.
-BACKLOG = 4096
+
+def listen(host: str, port: int) -> socket.socket:
+    """Open a listening socket.
+
+    Raises:
+        DeviceError: the address is invalid or in use.
+    """
+    if not 0 <= port <= HIGHEST_PORT:
+        raise DeviceError(f"cannot listen at {host}:{port}: a port is a number from 0 to {HIGHEST_PORT}")
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        reason = (error.strerror or str(error)).partition(" (")[0]
+        raise DeviceError(f"cannot listen at {host}:{port}: {reason}") from None
+
+
+# TCP servers
+
+LOOK_S = 0.05  # period of checking whether the device is absent or the server closes [s]
+
+
+class TcpServer:
+    """A TCP server that serves each connection on a thread of its own; a context manager.
+
+    Args:
+        serve: serves a connection, which is closed afterwards; an OSError ends it.
+        host: address to listen at.
+        port: to listen at; 0 for any free port.
+        absent: returns whether the device is unplugged now, which closes the port; called every `LOOK_S`.
+
+    Attributes:
+        closing: set when the server closes; long waits in ``serve`` must end then.
+
+    Raises:
+        DeviceError: the address is invalid or in use.
+    """
+
+    def __init__(
+        self,
+        serve: Callable[[socket.socket], None],
+        host: str = LOCAL,
+        port: int = 0,
+        absent: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._serve, self._absent = serve, absent
+        self._listener: socket.socket | None = listen(host, port)
+        self.host, self.port = host, int(self._listener.getsockname()[1])
+        self.closing = threading.Event()
+        self._lock = threading.Lock()
+        self._open: set[socket.socket] = set()
+        self._threads: list[threading.Thread] = []
+        self._acceptor = threading.Thread(target=self._accept, name=f"port {self.port}", daemon=True)
+        self._acceptor.start()
+
+    def close(self) -> None:
+        """Close the port and the connections, and wait for the threads; may be called again."""
+        self.closing.set()
+        self._acceptor.join()
+        self._hang_up()
+        for thread in self._threads:
+            thread.join()
+
+    def __enter__(self) -> Self:
+        """Return the server itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the server."""
+        self.close()
+
+    def _accept(self) -> None:
+        while not self.closing.is_set():
+            if self._absent():
+                self._hang_up()
+                self.closing.wait(LOOK_S)
+                continue
+            try:
+                self._listener = self._listener or listen(self.host, self.port)
+            except DeviceError:  # another program has the port for now
+                self.closing.wait(LOOK_S)
+                continue
+            self._listener.settimeout(LOOK_S)
+            with contextlib.suppress(OSError):  # no client in time, or it is gone already
+                self._welcome(self._listener.accept()[0])
+
+    def _welcome(self, connection: socket.socket) -> None:
+        connection.settimeout(None)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        with self._lock:
+            self._open.add(connection)
+        thread = threading.Thread(target=self._run, args=(connection,), name=f"client {self.port}", daemon=True)
+        self._threads = [*(other for other in self._threads if other.is_alive()), thread]
+        thread.start()
+
+    def _run(self, connection: socket.socket) -> None:
+        try:
+            with contextlib.suppress(OSError):  # the client is gone
+                self._serve(connection)
+        finally:
+            with self._lock:
+                self._open.discard(connection)
+                connection.close()
+
+    def _hang_up(self) -> None:
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+        with self._lock:
+            for connection in self._open:
+                with contextlib.suppress(OSError):  # the client is gone
+                    connection.shutdown(socket.SHUT_RDWR)
+
+
+LONGEST_LINE = 65536  # of JSON lines [bytes]
+
+
+class JsonLines(TcpServer):
+    """Server of JSON lines, one object each; a context manager.
+
+    Args:
+        answer: makes the answer to an object; a `CotargetError`, or an error that a wrong object raises, becomes
+            {"error": ...}.
+        host: address to listen at.
+        port: to listen at; 0 for any free port.
+
+    Raises:
+        DeviceError: the address is invalid or in use.
+    """
+
+    def __init__(self, answer: Callable[[Any], Any], host: str = LOCAL, port: int = 0) -> None:
+        self._answer = answer
+        super().__init__(self._converse, host, port)
+
+    def _converse(self, connection: socket.socket) -> None:
+        with connection.makefile("rb") as lines:
+            while line := lines.readline(LONGEST_LINE):
+                connection.sendall(json.dumps(self._answered(line)).encode() + b"\n")
+
+    def _answered(self, line: bytes) -> Any:
+        try:
+            return self._answer(json.loads(line))
+        except CotargetError as error:
+            return {"error": str(error)}
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            return {"error": f"not understood: {type(error).__name__}: {error}"}
+
+
+# The serial line
+
+BITS = 10  # of a byte: start, eight, stop
+BACKLOG = 4096  # most bytes under way to the firmware; beyond that the sender must wait
 
 
 class Firmware(Protocol):
-    """The device behind a line, as `Wire` uses it."""
+    """The device behind a serial line."""
 
     faults: Faults
 
@@ -46,9 +190,6 @@ class Firmware(Protocol):
     @property
     def byte_delay_s(self) -> float:
         """Pause after each sent byte [s]."""
-
-    def set_baud(self, baud: int) -> None:
-        """Set the baud rate of the serial port, for power-up too."""
 
     def receive(self, data: bytes) -> None:
         """Process bytes that arrive."""
@@ -61,18 +202,12 @@ class Firmware(Protocol):
 
 
 class Wire:
-    """Bytes under way between a firmware and its client, each with the arrival time of its last bit.
+    """Bytes under way between a firmware and its client, each with the arrival time of its last bit."""
 
-    Args:
-        firmware: the device.
-        paced: whether bytes take time.
-    """
-
-    def __init__(self, firmware: Firmware, paced: bool = True) -> None:
+    def __init__(self, firmware: Firmware) -> None:
         self._firmware = firmware
-        self._paced = paced
         self._noise = random.Random(0)
-        self._baud = firmware.baud  # baud rate of the firmware's next output
+        self._baud = firmware.baud  # of the firmware's next output
         self._in: deque[tuple[float, int, int | None]] = deque()
         self._out: deque[tuple[float, int, int]] = deque()
         self._in_free = self._out_free = 0.0
@@ -91,8 +226,7 @@ class Wire:
             baud: the client's baud rate; if it differs from the firmware's, noise arrives. None for the firmware's own.
         """
         for byte in data:
-            took = BITS / (baud or self._firmware.baud) if self._paced else 0.0
-            self._in_free = max(self._in_free, now) + took
+            self._in_free = max(self._in_free, now) + BITS / (baud or self._firmware.baud)
             self._in.append((self._in_free, byte, baud))
 
     def step(self, now: float, baud: int | None = None) -> bytes:
@@ -111,8 +245,7 @@ class Wire:
 
     def due(self) -> float | None:
         """Return when the next byte arrives at either end [s]; None if none is under way."""
-        times = [way[0][0] for way in (self._in, self._out) if way]
-        return min(times, default=None)
+        return min((way[0][0] for way in (self._in, self._out) if way), default=None)
 
     def clear(self) -> None:
         """Drop the bytes under way, and the firmware's output."""
@@ -123,228 +256,93 @@ class Wire:
     def _collect(self, ready: float) -> None:
         """Put the firmware's output on the wire; a change of its baud rate applies from the next output on."""
         for byte in self._firmware.output():
-            took = BITS / self._baud + self._firmware.byte_delay_s if self._paced else 0.0
-            self._out_free = max(self._out_free, ready) + took
+            self._out_free = max(self._out_free, ready) + BITS / self._baud + self._firmware.byte_delay_s
             self._out.append((self._out_free, byte, self._baud))
         self._baud = self._firmware.baud
 
 
-# JSON lines
+# Ports of a unit
 
-LONGEST_LINE = 65536  # bytes
-HEARTBEAT = 0.1  # period of checking whether the server must end [s]
-
-
-class JsonLines:
-    """Server of any number of clients, each on a thread of its own; a context manager.
-
-    Args:
-        answer: makes the answer to an object; a `CotargetError`, or an error that a wrong object raises, becomes
-            {"error": ...}.
-        host: address to listen at.
-        port: to listen at; 0 for any free port.
-
-    Raises:
-        DeviceError: the address is invalid or in use.
-    """
-
-    def __init__(self, answer: Callable[[Any], Any], host: str = "127.0.0.1", port: int = 0) -> None:
-        class Handler(socketserver.StreamRequestHandler):
-            def handle(self) -> None:
-                while line := self.rfile.readline(LONGEST_LINE):
-                    self.wfile.write(json.dumps(_answered(answer, line)).encode() + b"\n")
-
-        try:
-            self._server = _Server((host, port), Handler)
-        except OSError as error:
-            raise DeviceError(f"cannot listen at {host}:{port}: {error.strerror or error}") from None
-        self.port: int = self._server.server_address[1]
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, args=(HEARTBEAT,), name=f"JSON lines {self.port}", daemon=True
-        )
-        self._thread.start()
-
-    def close(self) -> None:
-        """Close the port and the connections; may be called again."""
-        self._server.shutdown()
-        self._server.hang_up()
-        self._server.server_close()
-        self._thread.join()
-
-    def __enter__(self) -> "JsonLines":
-        """Return the server itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the server."""
-        self.close()
-
-
-class _Server(socketserver.ThreadingTCPServer):
-    """TCP server that stores its clients, so that it can close their connections."""
-
-    allow_reuse_address = True
-    daemon_threads = True
-
-    def __init__(self, *arguments: Any) -> None:
-        self._clients: set[Any] = set()
-        super().__init__(*arguments)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Store the client and serve it."""
-        self._clients.add(request)
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        """Drop the client and close its connection."""
-        self._clients.discard(request)
-        super().shutdown_request(request)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore a client that is gone."""
-
-    def hang_up(self) -> None:
-        """Close every connection."""
-        for request in list(self._clients):
-            self.shutdown_request(request)
-
-
-def _answered(answer: Callable[[Any], Any], line: bytes) -> Any:
-    try:
-        return answer(json.loads(line))
-    except CotargetError as error:
-        return {"error": str(error)}
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        return {"error": f"not understood: {type(error).__name__}: {error}"}
-
-
-# Lines of a unit
-
-# Period of asking an idle firmware for output, and of checking whether the line closes [s].
-TICK_S = 0.005
-# A TCP client that reads nothing for this time is dropped [s].
-SEND_TIMEOUT_S = 1.0
+TICK_S = 0.005  # period of asking an idle firmware for output, and of checking whether the ports close [s]
+SEND_TIMEOUT_S = 1.0  # a TCP client that reads nothing for this time is dropped [s]
 SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 CODES = {baud: code for code, baud in SPEEDS.items()}
 
 
-def _wait(wire: Wire, readers: list[int]) -> list[int]:
-    """Wait for input, for the next byte to arrive, or for a tick; return the readable descriptors."""
-    due = wire.due()
-    timeout = TICK_S if due is None else min(max(due - time.monotonic(), 0.0), TICK_S)
-    return select.select(readers, [], [], timeout)[0]
+class UnitPorts:
+    """The ports of a unit, which serve one program at a time; a context manager.
 
+    The pseudo-terminal behaves as a serial port: a client with another baud rate than the unit exchanges noise with it.
+    The TCP port is as of a serial device server. Its client locks the pseudo-terminal and is refused where another
+    program has locked it. A second client replaces the first, because one that vanished, such as by a pulled cable,
+    would otherwise block the unit for ever. While the fault unplugged is on, there are no ports; afterwards the
+    pseudo-terminal may have another name.
 
-def _baud(slave: int) -> int | None:
-    """Return the baud rate that the client has set; None for baud 0, a line that was hung up."""
-    return SPEEDS.get(termios.tcgetattr(slave)[5]) or None
+    Args:
+        firmware: the unit.
+        serial: whether there is a pseudo-terminal.
+        tcp: TCP port to listen at, 0 for any free one; None for none.
+        host: address to listen at.
 
+    Raises:
+        DeviceError: the address is invalid or in use, or the machine has no pseudo-terminal left.
+    """
 
-class _Line(abc.ABC):
-    """Common part of both lines: a thread that serves the unit until the line is closed."""
-
-    def __init__(self, firmware: Firmware, wire: Wire) -> None:
-        self._firmware, self._wire = firmware, wire
+    def __init__(self, firmware: Firmware, *, serial: bool = True, tcp: int | None = None, host: str = LOCAL) -> None:
+        self._firmware, self._wire, self._serial = firmware, Wire(firmware), serial
+        self._ends: tuple[int, int] | None = None  # emulator's and client's end; the latter stays open here too,
+        self.port = ""  # because without any open client's end the emulator's fails
+        self._listener = None if tcp is None else listen(host, tcp)
+        self._address = None if self._listener is None else (host, int(self._listener.getsockname()[1]))
+        self._client: socket.socket | None = None
+        try:
+            self._plug_in()
+        except OSError as error:
+            self._unplug()
+            raise DeviceError(f"no pseudo-terminal: {error.strerror}") from None
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name=f"d46 {type(self).__name__}", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name="unit ports", daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """URL of the TCP port for pyserial and rig.toml."""
+        assert self._address is not None
+        return "socket://{}:{}".format(*self._address)
 
     def close(self) -> None:
-        """End the thread and remove the port."""
+        """End the thread and remove the ports."""
         self._closing.set()
         self._thread.join()
 
     def __enter__(self) -> Self:
-        """Return the line itself."""
+        """Return the ports themselves."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the line."""
+    def __exit__(self, *_: object) -> None:
+        """Close the ports."""
         self.close()
 
     def _serve(self) -> None:
+        plugged = True
         while not self._closing.is_set():
             if "unplugged" in self._firmware.faults:
                 self._unplug()
+                plugged = False
                 self._firmware.faults.wait_while("unplugged", TICK_S)
-            elif self._is_plugged_in():
+            elif plugged:
                 self._exchange()
             else:
-                self._plug_in()
+                with contextlib.suppress(OSError, DeviceError):  # another program has the port for now
+                    self._plug_in()
+                    plugged = True
         self._unplug()
 
-    @abc.abstractmethod
-    def _is_plugged_in(self) -> bool:
-        """Return whether the port exists."""
-
-    @abc.abstractmethod
     def _plug_in(self) -> None:
-        """Make the port."""
-
-    @abc.abstractmethod
-    def _unplug(self) -> None:
-        """Remove the port; may be called again."""
-
-    @abc.abstractmethod
-    def _exchange(self) -> None:
-        """Pass on the bytes that are due, and wait for more."""
-
-
-class SerialLine(_Line):
-    """A pseudo-terminal that behaves as a serial port with the unit at its end; a context manager.
-
-    A client with another baud rate than the unit exchanges noise with it. While the fault unplugged is on, the port
-    does not exist; afterwards there is one again, possibly with another name.
-
-    Args:
-        firmware: the unit.
-        baud: set for the unit, as by an earlier `@`; None leaves the unit's. The port has it too, until a client sets
-            another.
-
-    Raises:
-        ConfigError: there is no such baud rate.
-        DeviceError: the machine has no pseudo-terminal left.
-    """
-
-    def __init__(self, firmware: Firmware, baud: int | None = None) -> None:
-        if baud is not None and baud not in CODES:
-            raise ConfigError(f"baud: {baud} is not one of: {', '.join(map(str, sorted(CODES)[1:]))}")
-        if baud is not None:
-            firmware.set_baud(baud)
-        super().__init__(firmware, Wire(firmware))
-        self._ends: tuple[int, int] | None = None  # emulator's and client's end; the latter stays open here too,
-        self._port = ""  # because without any open client's end the emulator's fails
-        try:
-            self._plug_in()
-        except OSError as error:
-            raise DeviceError(f"no pseudo-terminal: {error.strerror}") from None
-        self._thread.start()
-
-    @property
-    def port(self) -> str:
-        """Name of the port; empty while unplugged."""
-        return self._port
-
-    def reserve(self) -> bool:
-        """Lock the port against programs that lock it too; return False if one has the lock."""
-        try:
-            if self._ends is not None:
-                fcntl.flock(self._ends[1], fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return False
-        return True
-
-    def release(self) -> None:
-        """Unlock the port."""
-        with contextlib.suppress(OSError):  # unplugged meanwhile
-            if self._ends is not None:
-                fcntl.flock(self._ends[1], fcntl.LOCK_UN)
-
-    def _is_plugged_in(self) -> bool:
-        return self._ends is not None
-
-    def _plug_in(self) -> None:
+        if self._address is not None and self._listener is None:
+            self._listener = listen(*self._address)
+        if not self._serial:
+            return
         master, slave = os.openpty()
         tty.setraw(master)
         tty.setraw(slave)
@@ -352,120 +350,96 @@ class SerialLine(_Line):
         attributes[4] = attributes[5] = CODES[self._firmware.baud]
         termios.tcsetattr(slave, termios.TCSANOW, attributes)
         os.set_blocking(master, False)
-        self._ends, self._port = (master, slave), os.ttyname(slave)
-
-    def _unplug(self) -> None:
-        if self._ends is not None:
-            self._port = ""
-            for end in self._ends:
-                os.close(end)
-            self._ends = None
-        self._wire.clear()
-
-    def _exchange(self) -> None:
-        assert self._ends is not None
-        master, slave = self._ends
-        arrived = self._wire.step(time.monotonic(), _baud(slave))
-        if arrived:
-            with contextlib.suppress(BlockingIOError):  # without a reader a serial port loses bytes
-                os.write(master, arrived)
-        room = self._wire.room
-        if master in _wait(self._wire, [master] if room else []):
-            with contextlib.suppress(BlockingIOError):
-                self._wire.feed(os.read(master, room), time.monotonic(), _baud(slave))
-
-
-class TcpLine(_Line):
-    """A TCP port with the unit behind it, as of a serial device server; a context manager.
-
-    It serves one client at a time. A second client replaces the first, whose connection is closed: a client that
-    vanished, such as by a pulled cable, would otherwise block the unit for ever. While the fault unplugged is on, the
-    port is closed.
-
-    Args:
-        firmware: the unit.
-        host: address to listen at; by default this machine only.
-        port: to listen at; 0 for any free port.
-        paced: whether bytes take their time on the unit's serial line.
-        beside: another line to the same unit, which serves only one of the two at a time; None if there is none.
-
-    Raises:
-        DeviceError: the address is invalid or in use.
-    """
-
-    def __init__(
-        self,
-        firmware: Firmware,
-        host: str = "127.0.0.1",
-        port: int = 0,
-        paced: bool = False,
-        beside: SerialLine | None = None,
-    ) -> None:
-        super().__init__(firmware, Wire(firmware, paced))
-        self._beside = beside
-        self._client: socket.socket | None = None
-        self.host, self.port = host, port
-        try:
-            self._listener: socket.socket | None = socket.create_server((host, port), backlog=1)
-        except OSError as error:
-            raise DeviceError(f"cannot listen at {host}:{port}: {error.strerror}") from None
-        self.port = self._listener.getsockname()[1]
-        self._thread.start()
-
-    @property
-    def url(self) -> str:
-        """URL of the port for pyserial and rig.toml."""
-        return f"socket://{self.host}:{self.port}"
-
-    def _is_plugged_in(self) -> bool:
-        return self._listener is not None
-
-    def _plug_in(self) -> None:
-        """Listen at the same port; if another program has it meanwhile, wait a tick."""
-        try:
-            self._listener = socket.create_server((self.host, self.port), backlog=1)
-        except OSError:
-            self._closing.wait(TICK_S)
+        self._ends, self.port = (master, slave), os.ttyname(slave)
 
     def _unplug(self) -> None:
         self._drop_client()
         if self._listener is not None:
             self._listener.close()
             self._listener = None
+        if self._ends is not None:
+            self.port = ""
+            for end in self._ends:
+                os.close(end)
+            self._ends = None
+        self._wire.clear()
+
+    def _exchange(self) -> None:
+        """Pass on the bytes that are due, and wait for more, or for a client."""
+        now, baud = time.monotonic(), self._baud()
+        if arrived := self._wire.step(now, baud):
+            self._send(arrived)
+        due = self._wire.due()
+        timeout = TICK_S if due is None else min(max(due - time.monotonic(), 0.0), TICK_S)
+        sources: list[Any] = [] if self._listener is None else [self._listener]
+        if self._wire.room:
+            sources += [] if self._client is None else [self._client]
+            sources += [] if self._ends is None else [self._ends[0]]
+        ready = select.select(sources, [], [], timeout)[0]
+        for source in ready:
+            if source is self._listener:
+                self._admit()
+            elif source is self._client:
+                self._hear()
+            elif self._ends is not None and source == self._ends[0]:
+                with contextlib.suppress(BlockingIOError):
+                    data = os.read(source, self._wire.room)
+                    if self._client is None:  # the port is locked by the client on TCP
+                        self._wire.feed(data, time.monotonic(), self._baud())
+
+    def _baud(self) -> int | None:
+        """Return the baud rate that the program at the pseudo-terminal has set; None for a line without one."""
+        if self._client is not None or self._ends is None:
+            return None
+        return SPEEDS.get(termios.tcgetattr(self._ends[1])[5]) or None
+
+    def _send(self, data: bytes) -> None:
+        if self._client is not None:
+            try:
+                self._client.sendall(data)
+            except OSError:  # the client is gone, or reads nothing
+                self._drop_client()
+        elif self._ends is not None:
+            with contextlib.suppress(BlockingIOError):  # without a reader a serial port loses bytes
+                os.write(self._ends[0], data)
+
+    def _hear(self) -> None:
+        assert self._client is not None
+        try:
+            data = self._client.recv(self._wire.room)
+        except OSError:
+            data = b""
+        if data:
+            self._wire.feed(data, time.monotonic())
+        else:
+            self._drop_client()
+
+    def _admit(self) -> None:
+        assert self._listener is not None
+        self._drop_client()
+        with contextlib.suppress(OSError):  # the client is gone already
+            newcomer = self._listener.accept()[0]
+            if not self._lock():
+                newcomer.close()
+                return
+            newcomer.settimeout(SEND_TIMEOUT_S)
+            newcomer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._client = newcomer
+            self._firmware.connected()
+
+    def _lock(self) -> bool:
+        """Lock the pseudo-terminal against programs that lock it too; return False if one has the lock."""
+        try:
+            if self._ends is not None:
+                fcntl.flock(self._ends[1], fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+        return True
 
     def _drop_client(self) -> None:
         if self._client is not None:
             self._client.close()
             self._client = None
-            if self._beside is not None:
-                self._beside.release()
-        self._wire.clear()
-
-    def _exchange(self) -> None:
-        """Pass on the bytes that are due, and wait for more, or for a client."""
-        assert self._listener is not None
-        arrived = self._wire.step(time.monotonic())
-        listener, client, room = self._listener, self._client, self._wire.room
-        try:
-            if client is not None and arrived:
-                client.sendall(arrived)
-            readers = [listener.fileno()] + ([client.fileno()] if client is not None and room else [])
-            ready = _wait(self._wire, readers)
-            if client is not None and client.fileno() in ready:
-                data = client.recv(room)
-                if not data:
-                    self._drop_client()
-                self._wire.feed(data, time.monotonic())
-        except OSError:  # the client is gone, or reads nothing for longer than SEND_TIMEOUT_S
-            self._drop_client()
-            return
-        if listener.fileno() in ready:
-            self._drop_client()
-            newcomer = listener.accept()[0]
-            if self._beside is not None and not self._beside.reserve():
-                newcomer.close()
-                return
-            self._client = newcomer
-            self._client.settimeout(SEND_TIMEOUT_S)
-            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._firmware.connected()
+            if self._ends is not None:
+                fcntl.flock(self._ends[1], fcntl.LOCK_UN)
+            self._wire.clear()

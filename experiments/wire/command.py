@@ -13,11 +13,12 @@ from cotarget.backends import open_rig
 from cotarget.config import RigConfig
 from cotarget.detection import Detection, Detector, make_detector
 from cotarget.drivers.clock import MonotonicClock
+from cotarget.emulators.process import EmulatedRig
 from cotarget.pipeline import follow
 from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, Speed
 from cotarget.safety.safe_rig import guard
 from experiments.engine.harness import Row
-from experiments.wire.rig import EmulatedRig, Tap, exact_calibration, load, tapped
+from experiments.wire.rig import Tap, exact_calibration, load, tapped
 
 SCENES = {"book": "indoor", "person": "outdoor"}
 ORDER = re.compile(rb"[PT][PS]-?\d+ ")  # first bytes of a move; queries have no number

@@ -25,11 +25,12 @@ from cotarget.backends import describe
 from cotarget.calibration import save_calibration
 from cotarget.config import parse_config
 from cotarget.emulators.emulation import FAULTS
+from cotarget.emulators.process import EmulatedRig, end
 from cotarget.geometry import Array
 from cotarget.sim.targets.paths import waypoint_path
 from cotarget.targeting import Reach, aim
 from experiments.engine.harness import Row
-from experiments.wire.rig import MOUNT, EmulatedRig, end, exact_calibration, load
+from experiments.wire.rig import MOUNT, exact_calibration, load
 
 # The book's round: x and z about the fixed camera's axis, at a distance [m], and its period [s].
 ROUND, DISTANCE, HEIGHT, PERIOD_S, KNOTS = (1.2, 0.6), 6.0, 1.6, 6.0, 8

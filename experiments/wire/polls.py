@@ -9,11 +9,12 @@ from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.ptu_d46 import D46Head, D46Settings
 from cotarget.drivers.rig import devices
 from cotarget.emulators.faults import Faults
+from cotarget.emulators.process import EmulatedRig
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import D46_PAPER
-from cotarget.emulators.serve import SerialLine
+from cotarget.emulators.serve import UnitPorts
 from experiments.engine.harness import Row
-from experiments.wire.rig import EmulatedRig, Tap, beside, load, tapped
+from experiments.wire.rig import Tap, beside, load, tapped
 
 BAUD, BITS = 9600, 10
 BYTES_S = BAUD / BITS
@@ -52,8 +53,8 @@ class Standing:
 def serve(pipe: Connection, position: tuple[int, int]) -> None:
     """Emulate a unit on a pseudo-terminal in another process, until the pipe receives something."""
     pan, tilt = map(Standing, position)
-    with SerialLine(D46(pan, tilt, D46_PAPER, Faults(D46_FAULTS), time.monotonic), BAUD) as line:
-        pipe.send(line.port)
+    with UnitPorts(D46(pan, tilt, D46_PAPER, Faults(D46_FAULTS), time.monotonic)) as ports:
+        pipe.send(ports.port)
         pipe.recv()
 
 

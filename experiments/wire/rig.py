@@ -1,24 +1,15 @@
-"""Emulated rig in another process, with its faults, its ground truth and its exact calibration."""
+"""What the experiments on the wire share: servers in other processes, taps on the serial line, an exact calibration."""
 
 import contextlib
-import json
 import multiprocessing
 import os
 import signal
-import socket
-import subprocess
-import sys
-import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import tomli_w
-
-from cotarget.backends import load_config
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.drivers import ptu_protocol, serial_line
@@ -26,112 +17,9 @@ from cotarget.errors import DeviceError
 from cotarget.evaluation import true_calibration
 from cotarget.sim.world import SimWorld
 
-READY, CONTROL = "connects to them", "control "  # output when it is ready, and prefix of the control socket
-LONGEST_S = 3600  # lifetime of an emulator whose parent was killed [s]
 END_S = 15.0  # timeout of a process's end [s]
-ANSWER_S = 10.0  # timeout of the control socket's answer [s]
 STOPS = 17  # zoom samples of the exact calibration; its spline between them is smoother than any lens
 MOUNT = 1.6  # height of the fixed camera in every scene [m]
-
-
-class EmulatedRig:
-    """Process of `cotarget emulate` with a simulated rig, until it is closed; a context manager.
-
-    Args:
-        folder: folder for its files.
-        tables: tables of the simulated rig's rig.toml.
-
-    Raises:
-        DeviceError: the process does not start.
-    """
-
-    def __init__(self, folder: Path, tables: Mapping[str, Any]) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._sim, self._written = folder / "sim.toml", folder / "hardware.toml"
-        self._sim.write_text(tomli_w.dumps(dict(tables)), encoding="utf-8")
-        self.sim: RigConfig = load_config(self._sim)
-        command = [sys.executable, "-m", "cotarget.cli", "emulate", "--rig", str(self._sim)]
-        command += ["--write", str(self._written), "--seconds", str(LONGEST_S)]
-        self._errors = (folder / "emulate.log").open("w+", encoding="utf-8")
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._errors, text=True)
-        try:
-            self._said = self._socket_of_control()
-        except BaseException:
-            self.close()
-            raise
-
-    def rig_toml(self) -> Path:
-        """Path of the rig.toml that connects to it now; a head that was unplugged returns under another name."""
-        tables = tomllib.loads(self._written.read_text(encoding="utf-8"))
-        tables["hardware"]["head"]["port"] = self.truth()["port"]
-        self._written.write_text(tomli_w.dumps(tables), encoding="utf-8")
-        return self._written
-
-    def config(self) -> RigConfig:
-        """Configuration from that rig.toml."""
-        return load_config(self.rig_toml())
-
-    def truth(self) -> dict[str, Any]:
-        """Give the current ground truth."""
-        return self._ask({"truth": True})
-
-    def switch(self, fault: str, on: bool = True) -> None:
-        """Switch a fault, named as device.fault."""
-        self._ask({"fault": fault, "on": on})
-
-    def close(self) -> None:
-        """End the process; safe to call more than once."""
-        if hasattr(self, "_connection"):
-            self._connection.close()
-        end(self._process)
-        if self._process.stdout is not None:
-            self._process.stdout.close()
-        self._errors.close()
-
-    def __enter__(self) -> "EmulatedRig":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _socket_of_control(self) -> Any:
-        assert self._process.stdout is not None
-        address = ""
-        for said in self._process.stdout:
-            if said.startswith(CONTROL):
-                address = said.split()[-1].removeprefix("socket://")
-            if READY in said:
-                host, _, port = address.rpartition(":")
-                self._connection = socket.create_connection((host, int(port)), ANSWER_S)
-                return self._connection.makefile("rw", encoding="utf-8")
-        raise self._failure("did not start")
-
-    def _ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
-        self._said.write(json.dumps(question) + "\n")
-        self._said.flush()
-        answer = self._said.readline()
-        if not answer:
-            raise self._failure("has ended")
-        told: dict[str, Any] = json.loads(answer)
-        if "error" in told:
-            raise DeviceError(f"the emulated rig says: {told['error']}")
-        return told
-
-    def _failure(self, what: str) -> DeviceError:
-        self._errors.seek(0)
-        words = self._errors.read().strip().splitlines() or ["without a word"]
-        return DeviceError(f"the emulated rig {what}: {words[-1]}")
-
-
-def end(process: "subprocess.Popen[str]") -> None:
-    """Terminate a process, then kill it if needed; not by SIGINT, which background processes ignore."""
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
 
 
 def exact_calibration(config: RigConfig) -> Calibration:

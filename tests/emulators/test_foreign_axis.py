@@ -5,15 +5,13 @@ import contextlib
 import re
 import shutil
 import subprocess
-import threading
-import time
 
 import cv2
 import numpy as np
 import pytest
 
-from cotarget.emulators.axis_241q import AxisServer, AxisUnit
-from cotarget.emulators.plant import Feed, Picture
+from cotarget.emulators.axis_241q import AxisServer
+from tests.support.plants import Film, decoded
 
 pytestmark = pytest.mark.foreign
 SIZE = (640, 480)
@@ -42,34 +40,9 @@ def number_of(image):
     return sum(1 << bit for bit in range(BITS) if image[int(side_v / 2), int((bit + 0.5) * side_u)].mean() > 128)
 
 
-class Filming:
-    """Publishes numbered pictures at a steady rate, as a camera does."""
-
-    def __init__(self):
-        self.feed = Feed()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self):
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self._stop.set()
-        self._thread.join(DEADLINE_S)
-
-    def _run(self):
-        index = 0
-        while True:
-            self.feed.publish(Picture(numbered(index), index, time.monotonic()))
-            index += 1
-            if self._stop.wait(1 / RATE_HZ):
-                return
-
-
 @contextlib.contextmanager
 def emulated(**options):
-    with Filming() as filming, AxisServer({1: filming.feed}, quality=90, **options) as server:
+    with Film(numbered, 1 / RATE_HZ) as film, AxisServer({1: film.feed}, quality=90, **options) as server:
         yield server
 
 
@@ -90,10 +63,6 @@ def consecutive(numbers):
 
 def curl(*arguments):
     return run("curl", "--silent", "--show-error", "--fail", "--max-time", "30", *arguments)
-
-
-def decoded(data):
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
 
 
 def test_curl_takes_a_snapshot():
@@ -145,9 +114,9 @@ def ffmpeg_frames(url, count, size=SIZE):
     return np.frombuffer(raw, np.uint8).reshape(count, size[1], size[0], 3)
 
 
-@pytest.mark.parametrize("unit", [AxisUnit(), AxisUnit(early_boundary=True)], ids=["boundary before", "boundary after"])
-def test_ffmpeg_decodes_a_stream(unit):
-    with emulated(unit=unit) as server:
+@pytest.mark.parametrize("early_boundary", [False, True])
+def test_ffmpeg_decodes_a_stream(early_boundary):
+    with emulated(early_boundary=early_boundary) as server:
         frames = ffmpeg_frames(f"{server.url}{STREAM}?camera=1&fps=25", 12)
     assert consecutive([number_of(frame) for frame in frames])
 
@@ -221,5 +190,5 @@ def test_pypi_axis_starts_as_it_does_with_a_younger_unit():
         assert (properties.api_http_version, properties.ptz) == (2, False)
         assert "4CIF" in properties.image_resolution.split(",")
 
-    with emulated(user="root", password="pass", unit=AxisUnit(parameters=younger)) as server:
+    with emulated(user="root", password="pass", more=younger) as server:
         with_axis(server, work)

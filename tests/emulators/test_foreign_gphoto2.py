@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
-from cotarget.emulators.faults import Faults
-from cotarget.emulators.plant import Feed, Picture
+from cotarget.emulators.canon_s5is import S5isServer
+from cotarget.emulators.plant import Feed
+from tests.support.plants import LensModel, publish
 
 pytestmark = pytest.mark.foreign
 TIMEOUT_S = 60  # gphoto2's own waits add up to a few seconds
@@ -49,24 +49,6 @@ KEYS = {"focuslock", "datetime", "ownername", "capturetarget", "capture", "image
 KEYS |= {"whitebalance", "zoom", "assistlight", "flashmode", "shootingmode", "aperture", "shutterspeed", "meteringmode"}
 
 
-class Lens:
-    """Moves at once."""
-
-    last = 128
-
-    def __init__(self):
-        self.commands = []
-
-    def command(self, position):
-        self.commands.append(position)
-
-    def position(self):
-        return self.commands[-1] if self.commands else 0
-
-    def moving(self):
-        return False
-
-
 def scene(size, position):
     """Blue above, and below a grey that tells the lens's position; in the right half green."""
     width, height = size
@@ -94,16 +76,16 @@ class View(Feed):
 
     def newest(self, after=-1, timeout=0.0):
         self.index = max(self.index, after) + 1
-        self.publish(Picture(scene((640, 480), self.lens.position()), self.index, time.monotonic()))
+        publish(self, self.index, scene((640, 480), self.lens.position()))
         return super().newest(after, timeout)
 
 
 @pytest.fixture
 def camera():
-    """An emulated camera that sees `scene`, with its lens and faults as attributes."""
-    lens, faults = Lens(), Faults(S5IS_FAULTS)
-    with S5isServer(View(lens), lambda: scene(STILL_SIZE, lens.position()), lens, faults=faults) as server:
-        server.lens, server.faults = lens, faults
+    """An emulated camera that sees `scene`, with its lens as an attribute."""
+    lens = LensModel()
+    with S5isServer(View(lens), lambda: scene(STILL_SIZE, lens.position()), lens) as server:
+        server.lens = lens
         yield server
 
 

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from cotarget.emulators.ptu_d46.unit import E_SERIES, UnitProfile
-from cotarget.emulators.serve import SerialLine, TcpLine
-from tests.emulators.test_ptu_d46 import live
+from tests.support.plants import LiveUnit
 
 pytestmark = [pytest.mark.foreign, pytest.mark.wire]
 SOURCE = Path(__file__).parents[1] / "data" / "mrpt_ptu.cpp"
@@ -76,8 +75,8 @@ class Program:
 
 
 def test_mrpt_moves_reads_back_halts_and_resets(mrpt_program):
-    unit, (pan, tilt), _ = live(SMALL)
-    with SerialLine(unit, 9600) as line, Program(mrpt_program, line.port) as mrpt:
+    with LiveUnit(SMALL) as live, Program(mrpt_program, live.ports.port) as mrpt:
+        pan, tilt = live.pan, live.tilt
         assert mrpt.result("resolution") == pytest.approx([STEP] * 2, abs=ROUNDING)
         assert mrpt.result("pan_limits") == pytest.approx([-583 * STEP, 583 * STEP], abs=ROUNDING)  # 30 / 0.0514286
         # MRPT truncates: 0.3 rad are 334.2 steps, 0.2 rad 222.8.
@@ -120,9 +119,9 @@ ptu.stream.close()
 
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="flir-ptu needs telnetlib, which Python 3.13 has no more")
 def test_flir_ptu_moves_reads_back_and_halts():
-    unit, (pan, tilt), _ = live(E_SERIES)
     command = (sys.executable, "-W", "ignore::DeprecationWarning", "-c", FLIR_PTU)
-    with TcpLine(unit) as line, Program(*command, str(line.port)) as flir:
+    with LiveUnit(E_SERIES, serial=False, tcp=0) as live, Program(*command, live.ports.url.rpartition(":")[2]) as flir:
+        pan, tilt = live.pan, live.tilt
         assert flir.result("moved") == [3000, -1500]
         assert (pan.position(), tilt.position()) == (3000, -1500)
         assert flir.result("desired") == [3000, -1500]

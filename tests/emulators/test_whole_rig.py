@@ -20,9 +20,23 @@ from cotarget.backends import describe, load_config, open_recording
 from cotarget.calibration import load_calibration
 from cotarget.config import RigConfig
 from cotarget.emulators.emulation import FAULTS
+from cotarget.emulators.process import EmulatedRig
+from cotarget.errors import DeviceError
 from cotarget.targeting import Reach, WantedSize, aim, point_at
 from tests.support.commands import call
-from tests.support.emulated_rig import DEADLINE_S, PASSWORD, Watch, emulated, meanwhile, program, way
+from tests.support.emulated_rig import (
+    DEADLINE_S,
+    PASSWORD,
+    Watch,
+    emulated,
+    follow,
+    meanwhile,
+    program,
+    wait_until_it_rests,
+    wait_until_it_turns,
+    way,
+)
+from tests.support.plants import wait_for
 
 pytestmark = [pytest.mark.wire, pytest.mark.render]
 MOUNT_M = 1.6  # the fixed camera's height above the indoor scene's floor; it looks along the world's y axis
@@ -136,19 +150,24 @@ def stays_within_limits(watch):
     return watch.stays_within(SOFT_PAN_DEG, HEAD.tilt_deg, HEAD.step_deg)
 
 
+def test_an_emulator_that_does_not_start_says_why(tmp_path):
+    with pytest.raises(DeviceError, match=r"did not start: cotarget emulate: .*nowhere"):
+        EmulatedRig(tmp_path, {"sim": {"scene": "nowhere"}})
+
+
 @stands
 def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
     table, again, recording = (rig.folder / name for name in ("wire.csv", "again.csv", "recording"))
-    status, out, err = run(capsys, *rig.follow("--seconds", STANDS_S, "--csv", table, "--record", recording))
+    status, out, err = run(capsys, *follow(rig, "--seconds", STANDS_S, "--csv", table, "--record", recording))
     assert status == 0
     assert all(BUSY.match(reason) for reason in told(err, "follow")), err
     states = json.loads(out)["states"]
     assert states["following"] > 0.8 * sum(states.values())
 
     # Where the book is by the file, not by what anybody saw.
-    config, (x, y, z) = load_config(rig.hardware), BOOK_M
+    config, (x, y, z) = load_config(rig.hardware_toml), BOOK_M
     book = config.target("book")
-    assert book.wanted_px == load_config(rig.sim).target("book").wanted_px / 2  # as the viewfinder's pictures are half
+    assert book.wanted_px == rig.sim.target("book").wanted_px / 2  # as the viewfinder's pictures are half
     spec = describe(config)
     calibration = load_calibration(rig.calibration).for_streams(spec.fixed.size, spec.zoom.size)
     there = aim(
@@ -172,21 +191,20 @@ def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
 @stands
 def test_the_rig_that_is_written_can_be_stopped(rig, capsys):
     """Though the simulated one's file names no stop file."""
-    assert run(capsys, "stop", "--rig", rig.hardware)[0] == 0
+    assert run(capsys, "stop", "--rig", rig.hardware_toml)[0] == 0
     assert (rig.folder / "stop").exists()
-    assert "emergency stop" in run(capsys, *rig.follow("--seconds", "1"))[2]
-    assert run(capsys, "clear", "--rig", rig.hardware)[0] == 0
+    assert "emergency stop" in run(capsys, *follow(rig, "--seconds", "1"))[2]
+    assert run(capsys, "clear", "--rig", rig.hardware_toml)[0] == 0
 
 
 @stands
 def test_the_simulation_opened_directly_aims_as_it_does_over_the_wire(rig, capsys):
     wire, direct = rig.folder / "wire.csv", rig.folder / "direct.csv"
-    command = [rig.sim if part == rig.hardware else part for part in rig.follow("--seconds", STANDS_S, "--csv", direct)]
-    assert run(capsys, *command)[0] == 0
+    assert run(capsys, *follow(rig, "--seconds", STANDS_S, "--csv", direct, rig_toml=rig.sim_toml))[0] == 0
     for _ in range(RUNS):
         if wire.exists() and np.allclose(end_of(wire), end_of(direct), rtol=0, atol=ALIKE_DEG):
             break
-        assert run(capsys, *rig.follow("--seconds", STANDS_S, "--csv", wire))[0] == 0
+        assert run(capsys, *follow(rig, "--seconds", STANDS_S, "--csv", wire))[0] == 0
     np.testing.assert_allclose(end_of(wire), end_of(direct), rtol=0, atol=ALIKE_DEG)
 
 
@@ -206,7 +224,7 @@ def test_a_rig_is_calibrated_over_the_wire_at_two_focal_lengths(rig, capsys):
 def check_calibration(rig, capsys, placements, stops):
     """Calibrate, and compare where it points with where the truth points."""
     out = rig.folder / "found.json"
-    files = ["--rig", rig.hardware, "--out", out]
+    files = ["--rig", rig.hardware_toml, "--out", out]
     status, said, err = run(capsys, "calibrate", *files, "--placements", placements, "--stops", stops)
     assert status == 0, err
     said, truth, found = json.loads(said), load_calibration(rig.calibration), load_calibration(out)
@@ -214,7 +232,7 @@ def check_calibration(rig, capsys, placements, stops):
         np.linalg.norm(truth.zoom_head.T_zoom0_fixed.translation), abs=BASELINE_M
     )
     predicted = next(iter(said["predicted_error_deg"].values()))  # at the shortest focal length
-    spec = describe(load_config(rig.sim))
+    spec = describe(rig.sim)
     reach = Reach(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range)
     misses = []
     for pixel in ((100, 100), (540, 100), (320, 240), (100, 380), (540, 380)):
@@ -236,14 +254,14 @@ def follow_until_it_breaks(rig, capsys, fault, more=()):
     at = []
 
     def break_it():
-        rig.wait_until_it_turns()
+        wait_until_it_turns(rig)
         at.append(rig.truth()["t"])
         rig.switch(fault)
 
     try:
         with Watch(rig) as watch, meanwhile(break_it):
-            status, _, err = run(capsys, *rig.follow(*more))
-            rig.wait_until_it_rests()
+            status, _, err = run(capsys, *follow(rig, *more))
+            wait_until_it_rests(rig)
     finally:
         rig.switch(fault, on=False)
     return status, err, watch, at[0]
@@ -278,7 +296,7 @@ def refused(rig, capsys):
     before = rig.truth()
     deadline = time.monotonic() + DEADLINE_S
     while True:
-        status, out, err = run(capsys, "point", "--rig", rig.hardware, "--pan-deg", "5")
+        status, out, err = run(capsys, "point", "--rig", rig.hardware_toml, "--pan-deg", "5")
         assert (status, out) == (1, "")
         if "starting up" not in err or time.monotonic() > deadline:
             break
@@ -294,13 +312,10 @@ def test_every_fault_is_survived_or_ends_in_one_line(rig, capsys, fault):
     status, err, watch, at = follow_until_it_breaks(rig, capsys, fault, ["--seconds", "6"])
     if fault in NEED_A_RESET:
         assert "cotarget reset-head" in refused(rig, capsys)
-        assert run(capsys, "reset-head", "--rig", rig.hardware, "--yes")[0] == 0
+        assert run(capsys, "reset-head", "--rig", rig.hardware_toml, "--yes")[0] == 0
     if fault == "head.unplugged":  # it comes back, maybe under another name
-        deadline = time.monotonic() + DEADLINE_S
-        while not (port := rig.truth()["port"]):
-            assert time.monotonic() < deadline
-        text = rig.hardware.read_text()
-        rig.hardware.write_text(text.replace(load_config(rig.hardware).hardware.head["port"], port))
+        wait_for(lambda: rig.truth()["port"])
+        rig.rig_toml()
     assert status in (0, 1)
     assert stays_within_limits(watch)
     if status == 0:
@@ -315,14 +330,14 @@ def test_every_fault_is_survived_or_ends_in_one_line(rig, capsys, fault):
 @moves
 def test_a_gap_in_the_stream_is_survived(rig, capsys):
     def break_it():
-        rig.wait_until_it_turns()
+        wait_until_it_turns(rig)
         rig.switch("fixed.cut")
         time.sleep(0.2)
         rig.switch("fixed.cut", on=False)
 
     table = rig.folder / "gap.csv"
     with Watch(rig) as watch, meanwhile(break_it):
-        status, _, err = run(capsys, *rig.follow("--seconds", "5", "--csv", table))
+        status, _, err = run(capsys, *follow(rig, "--seconds", "5", "--csv", table))
     assert status == 0
     told(err, "follow")
     assert stays_within_limits(watch)
@@ -335,12 +350,12 @@ def test_a_gap_in_the_stream_is_survived(rig, capsys):
     ("number", "shell"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
 )
 def test_a_signal_ends_in_a_head_that_rests(rig, number, shell):
-    with Watch(rig) as watch, program(*rig.follow("--seconds", "60")) as process:
-        rig.wait_until_it_turns()
+    with Watch(rig) as watch, program(*follow(rig, "--seconds", "60")) as process:
+        wait_until_it_turns(rig)
         at = rig.truth()["t"]
         process.send_signal(number)
         _, err = process.communicate(timeout=DEADLINE_S)
-        rig.wait_until_it_rests()
+        wait_until_it_rests(rig)
     assert process.returncode == shell
     assert "Traceback" not in err
     assert ("cotarget follow: interrupted" in err) == (number == signal.SIGINT)
@@ -354,36 +369,36 @@ def test_an_operator_elsewhere_stops_it_until_it_is_cleared(rig, capsys):
     at = []
 
     def stop():
-        rig.wait_until_it_turns()
-        with program("stop", "--rig", rig.hardware, "--reason", "somebody is in the way") as stopping:
+        wait_until_it_turns(rig)
+        with program("stop", "--rig", rig.hardware_toml, "--reason", "somebody is in the way") as stopping:
             said = stopping.communicate(timeout=DEADLINE_S)
         at.append(rig.truth()["t"])
         assert said == (f"stopped: no head that watches {rig.folder / 'stop'} moves until cotarget clear\n", "")
 
     why = "cotarget follow: emergency stop: somebody is in the way; when it is safe to move, run 'cotarget clear"
     with Watch(rig) as watch, meanwhile(stop):
-        status, _, err = run(capsys, *rig.follow("--seconds", "60"))
-        rig.wait_until_it_rests()
+        status, _, err = run(capsys, *follow(rig, "--seconds", "60"))
+        wait_until_it_rests(rig)
     assert status == 1
     assert err.startswith(why)
     assert len(err.splitlines()) == 1
     assert watch.rests_since() - at[0] < RESTS_S
 
-    status, _, err = run(capsys, *rig.follow("--seconds", "60"))
+    status, _, err = run(capsys, *follow(rig, "--seconds", "60"))
     assert status == 1
     assert err.startswith(why)
-    assert run(capsys, "clear", "--rig", rig.hardware) == (0, "cleared: somebody is in the way\n", "")
-    assert run(capsys, "clear", "--rig", rig.hardware)[1].endswith("stop: there was no stop\n")
-    assert run(capsys, *rig.follow("--seconds", "0.3"))[0] in (0, 4)  # it moves again; so short a run may see nobody
+    assert run(capsys, "clear", "--rig", rig.hardware_toml) == (0, "cleared: somebody is in the way\n", "")
+    assert run(capsys, "clear", "--rig", rig.hardware_toml)[1].endswith("stop: there was no stop\n")
+    assert run(capsys, *follow(rig, "--seconds", "0.3"))[0] in (0, 4)  # it moves again; so short a run may see nobody
 
 
 @moves
 def test_a_head_that_another_program_has_is_not_taken(rig, capsys):
-    port = load_config(rig.hardware).hardware.head["port"]
-    rig.wait_until_it_rests()
+    port = load_config(rig.hardware_toml).hardware.head["port"]
+    wait_until_it_rests(rig)
     before = rig.truth()
     with serial.Serial(port, exclusive=True):
-        status, out, err = run(capsys, *rig.follow("--seconds", "60"))
+        status, out, err = run(capsys, *follow(rig, "--seconds", "60"))
     assert (status, out, err) == (1, "", f"cotarget follow: {port} is in use by another program\n")
     assert rig.truth()["pan_deg"] == before["pan_deg"]
 
@@ -392,22 +407,22 @@ def test_a_head_that_another_program_has_is_not_taken(rig, capsys):
 @moves
 def test_a_head_that_is_taken_away_on_a_network_ends_in_one_line(rig, capsys):
     """A terminal server serves one; here who comes last, so that one whose cable was pulled does not keep it."""
-    serial_port = load_config(rig.hardware).hardware.head["port"]
-    address = rig.said["head"].rsplit("socket://", 1)[1].strip()
-    text = rig.hardware.read_text()
+    serial_port = load_config(rig.hardware_toml).hardware.head["port"]
+    address = rig.addresses["head"].rsplit("socket://", 1)[1]
+    text = rig.hardware_toml.read_text()
 
     def take_it():
-        rig.wait_until_it_turns()
+        wait_until_it_turns(rig)
         host, port = address.split(":")
         socket.create_connection((host, int(port))).close()
 
     try:
-        rig.hardware.write_text(text.replace(serial_port, f"socket://{address}"))
+        rig.hardware_toml.write_text(text.replace(serial_port, f"socket://{address}"))
         with Watch(rig) as watch, meanwhile(take_it):
-            status, _, err = run(capsys, *rig.follow("--seconds", "60"))
-            rig.wait_until_it_rests()
+            status, _, err = run(capsys, *follow(rig, "--seconds", "60"))
+            wait_until_it_rests(rig)
     finally:
-        rig.hardware.write_text(text)
+        rig.hardware_toml.write_text(text)
     assert status == 1
     assert err.startswith(f"cotarget follow: the line to the pan-tilt unit at socket://{address} is lost")
     assert len(err.splitlines()) == 1
@@ -417,10 +432,10 @@ def test_a_head_that_is_taken_away_on_a_network_ends_in_one_line(rig, capsys):
 @moves
 def test_a_wrong_password_is_told(rig, capsys, monkeypatch):
     monkeypatch.setenv("COTARGET_PASSWORD", "guessed")
-    rig.wait_until_it_rests()
+    wait_until_it_rests(rig)
     before = rig.truth()
-    status, out, err = run(capsys, *rig.follow("--seconds", "60"))
-    url = load_config(rig.hardware).hardware.fixed["url"]
+    status, out, err = run(capsys, *follow(rig, "--seconds", "60"))
+    url = load_config(rig.hardware_toml).hardware.fixed["url"]
     assert (status, out) == (1, "")
     assert err.startswith(f"cotarget follow: {url} refuses the user 'viewer' (401): check hardware.fixed.user and the")
     assert len(err.splitlines()) == 1
@@ -434,9 +449,9 @@ def test_all_plugs_pulled_at_once_end_in_one_error_and_whole_files(number, tmp_p
     (tmp_path / "rig").mkdir()
     film, steps, recording = (tmp_path / name for name in ("film.mp4", "steps.csv", "recording"))
     with emulated(tmp_path / "rig", table, *options) as rig:
-        process = program(*rig.follow("--seconds", "60", "--video", film, "--csv", steps, "--record", recording))
+        process = program(*follow(rig, "--seconds", "60", "--video", film, "--csv", steps, "--record", recording))
         try:
-            rig.wait_until_it_turns()
+            wait_until_it_turns(rig)
             rig.process.send_signal(number)
             out, err = process.communicate(timeout=DEADLINE_S)
         finally:

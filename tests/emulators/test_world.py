@@ -1,4 +1,4 @@
-"""The emulated world: axes and lens in simulated time, two firmwares on one head, and once the whole in real time."""
+"""The emulated world: axes and lens in simulated time, and once the whole in real time."""
 
 import math
 import socket
@@ -9,18 +9,15 @@ import numpy as np
 import pytest
 
 from cotarget.config import RigConfig, SimConfig, parse_config
-from cotarget.emulators.faults import Faults
-from cotarget.emulators.ptu_d46.firmware import D46_FAULTS, make_twins
-from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.emulators.serve import JsonLines
-from cotarget.emulators.world import FIXED_HZ, OLDEST, ZOOM_HZ, EmulatedAxis, EmulatedLens, LiveWorld, paced
+from cotarget.emulators.world import FIXED_HZ, OLDEST, ZOOM_HZ, EmulatedAxis, EmulatedLens, LiveWorld, WallClock, paced
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import pose
 from cotarget.sim.motion import HISTORY_S, Axis, HeadDrive, LensDrive
+from tests.support.plants import DEADLINE_S, wait_for
 
 STEP = math.radians(0.05)  # [rad]
 DELAY = 0.04  # from a command to motion [s]
-DEADLINE_S = 30.0  # for whatever must happen at all, on a machine that is busy with other things
 
 
 class FakeClock:
@@ -132,74 +129,6 @@ def test_a_lens_goes_where_it_is_sent_and_no_farther_than_it_can(clock):
     assert (plant.position(), plant.moving()) == (0, False)
 
 
-@pytest.fixture
-def twins(clock):
-    faults = Faults(D46_FAULTS)
-    plants = axis(clock), axis(clock)
-    made = make_twins(*plants, D46_STOCK, faults, clock.now)
-    for twin in made:
-        twin.receive(b"ED FT ")
-        twin.output()
-    return *made, faults, plants[0]
-
-
-def later(clock, twins, seconds):
-    """What both say meanwhile; the one that nobody speaks to is asked first."""
-    said = dict.fromkeys(twins, b"")
-    for _ in range(round(seconds / 0.01)):
-        clock.t += 0.01
-        for twin in twins:
-            said[twin] += twin.output()
-    return list(said.values())
-
-
-def test_a_blow_is_told_to_who_moves_the_head(clock, twins):
-    idle, used, faults, pan = twins
-    used.receive(b"PP1000 ")
-    faults.set("limit-hit")
-    silence, said = later(clock, (idle, used), 0.5)
-    assert silence == b""
-    assert b"!P" in said
-    assert "limit-hit" not in faults
-    assert not pan.moving()
-    used.receive(b"PP0 ")
-    clock.t += 5.0
-    assert b"!P" not in used.output() + idle.output()
-
-
-def test_a_gap_in_the_power_is_met_by_who_speaks_to_it(clock, twins):
-    idle, used, faults, _ = twins
-    used.receive(b"PP ")
-    faults.set("power-cycle")
-    silence, said = later(clock, (idle, used), D46_STOCK.boot_s + 0.1)
-    assert silence == b""
-    assert D46_STOCK.title.encode() in said
-
-
-def test_what_lasts_is_wrong_with_both(twins):
-    for fault in ("silence", "error-replies"):
-        *both, faults, _ = twins
-        faults.set(fault)
-        for twin in both:
-            twin.receive(b"PP ")
-            assert twin.output() == (b"" if fault == "silence" else b"! Illegal argument\r\n")
-        faults.set(fault, False)
-        for twin in both:
-            assert fault not in twin.faults
-            twin.receive(b"PP ")
-            assert twin.output() == b"* 0\r\n"
-
-
-def test_who_speaks_at_a_twin_waits_for_its_faults(twins):
-    first, *_, faults, _ = twins
-    assert first.faults.wait_while("unplugged", 0.0)
-    first.faults.set("unplugged")
-    assert "unplugged" in faults
-    assert not first.faults.wait_while("unplugged", 0.0)
-    with pytest.raises(ConfigError, match="unknown fault 'rust'"):
-        first.faults.set("rust")
-
-
 def test_real_time_is_kept_by_fewer_frames_and_plainer_ones():
     config = RigConfig()
     sim = paced(config).sim
@@ -261,10 +190,11 @@ def test_a_world_that_cannot_be_made_says_why():
 class FakeWorld:
     """In the place of the simulated one: it shows black, and does to an exposure what the test says."""
 
+    closed = 0
+
     def __init__(self, config, clock):
         self.head_drive = HeadDrive(Axis(1.0, 1.0), Axis(1.0, 1.0))
         self.lens_drive = LensDrive(667.0, 8000.0, 128, True, Axis(129.0, math.inf))
-        self.closed = 0
 
     def expose(self, name, index, t):
         FakeWorld.act(t)
@@ -272,18 +202,37 @@ class FakeWorld:
         return np.zeros((4, 4, 3), np.uint8)
 
     def close(self):
-        self.closed += 1
+        FakeWorld.closed += 1
+
+
+class SleepyClock(WallClock):
+    """A clock that can go on by some time at once, as after a machine's sleep."""
+
+    slept = 0.0
+
+    def now(self):
+        return super().now() + self.slept
 
 
 @pytest.fixture
 def fake(monkeypatch):
     monkeypatch.setattr("cotarget.emulators.world.SimWorld", FakeWorld)
+    monkeypatch.setattr("cotarget.emulators.world.WallClock", SleepyClock)
     monkeypatch.setattr(FakeWorld, "act", lambda t: None, raising=False)
+    monkeypatch.setattr(FakeWorld, "closed", 0)
     return FakeWorld
 
 
 def no_memory(*_):
     raise MemoryError("no more")
+
+
+def has_failed(world):
+    try:
+        world.check()
+    except DeviceError:
+        return True
+    return False
 
 
 @pytest.mark.wire
@@ -303,14 +252,11 @@ def test_a_world_that_fails_later_says_so_to_who_asks(fake):
         world.check()
         assert world.still().shape == (4, 4, 3)
         fake.act = no_memory
-        deadline = time.monotonic() + DEADLINE_S
-        while not world._failure:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        wait_for(lambda: has_failed(world))
         for call in (world.check, world.still):
             with pytest.raises(DeviceError, match=r"the simulated world failed: MemoryError\('no more'\)"):
                 call()
-        assert world._world.closed == 1
+    assert fake.closed == 1
 
 
 @pytest.mark.wire
@@ -327,15 +273,11 @@ def test_a_world_goes_on_after_the_machine_stood_still(fake):
         world.pan.command(10, 1000, 1000)
         fake.act = act
         assert exposing.wait(DEADLINE_S)
-        world.clock._start -= 4 * HISTORY_S
+        world.clock.slept = 4 * HISTORY_S
         world.pan.command(0, 1000, 1000)
         awake.set()
         after = world.clock.now()
-        newest = world.feeds["fixed"].newest()
-        deadline = time.monotonic() + DEADLINE_S
-        while newest is None or newest.t < world.clock.monotonic(after):
-            assert time.monotonic() < deadline
-            newest = world.feeds["fixed"].newest(after=-1 if newest is None else newest.index, timeout=DEADLINE_S)
+        wait_for(lambda: moments[-1] > after)
         world.check()
     assert moments[0] < after - OLDEST
     assert not [t for t in moments[1:] if t < after - OLDEST]

@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import math
 import os
 import subprocess
 import sys
@@ -16,14 +15,10 @@ import pytest
 
 from cotarget.drivers.ptu_d46 import D46Settings
 from cotarget.emulators.axis_241q import AxisServer
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, Picture
-from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
-from cotarget.emulators.serve import SerialLine, TcpLine
-from cotarget.sim.motion import Axis
+from tests.support.plants import DEADLINE_S, LiveUnit
 
-DEADLINE_S = 20.0  # of real time: a loaded machine has reached it only if something hangs
 FEED_S = 0.04  # between the pictures of the emulated video server
 FEED_SIZE = (320, 240)
 USER, PASSWORD = "root", "hunter2 & co"
@@ -71,38 +66,7 @@ def picture_number(image):
 # The pan-tilt unit PTU-D46
 
 
-class Plant:
-    """An axis in real time, with the simulation's trapezoids."""
-
-    def __init__(self):
-        self.axis, self.rests, self.lock = Axis(1e6, 1.0), -math.inf, threading.Lock()
-
-    def command(self, goal, speed, acceleration):
-        with self.lock:
-            self.axis.acceleration = acceleration
-            self.rests = self.axis.command(time.monotonic(), goal, speed)
-
-    def halt(self, acceleration):
-        with self.lock:
-            self.axis.acceleration = acceleration
-            self.rests = self.axis.halt(time.monotonic())
-
-    def at(self, t):
-        with self.lock:
-            return self.axis.motor(t)
-
-    def position(self):
-        return round(self.at(time.monotonic())[0])
-
-    def speed(self):
-        return self.at(time.monotonic())[1]
-
-    def moving(self):
-        with self.lock:
-            return time.monotonic() < self.rests
-
-
-class D46Unit:
+class D46Unit(LiveUnit):
     """An emulated unit behind a paced pseudo-terminal or TCP; a context manager.
 
     Attributes:
@@ -110,26 +74,15 @@ class D46Unit:
     """
 
     def __init__(self, profile=D46_STOCK, tcp=False):
-        self.pan, self.tilt, self.faults = Plant(), Plant(), Faults(D46_FAULTS)
-        unit = D46(self.pan, self.tilt, profile, self.faults, time.monotonic)
-        self.line = TcpLine(unit) if tcp else SerialLine(unit)
+        super().__init__(profile, serial=not tcp, tcp=0 if tcp else None)
         step = profile.step / 3600
         self.config = D46Settings(
-            port=self.line.url if tcp else self.line.port,
+            port=self.ports.url if tcp else self.ports.port,
             step_deg=step,
             pan_deg=tuple(step * end for end in profile.pan),
             tilt_deg=tuple(step * end for end in profile.tilt),
             pan_sign=1,
         )
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.line.close()
-
-    def turning(self):
-        return self.pan.moving() or self.tilt.moving()
 
 
 # The Canon PowerShot S5 IS: in a process of its own, because libgphoto2 would hold up its threads

@@ -9,7 +9,7 @@ published drivers read from real units. Where these disagree, the profiles do to
 
 import copy
 import math
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 from cotarget.emulators.plant import AxisPlant
@@ -60,7 +60,6 @@ class UnitProfile:
     """A model of pan-tilt unit, with the behaviour of its firmware.
 
     Attributes:
-        name: of the profile.
         version: of the firmware; later commands are unknown to it.
         title: reply to the query of the version.
         step: resolution of both axes [arc seconds].
@@ -81,13 +80,10 @@ class UnitProfile:
         leading_lf: whether the answer to a command that ends with CR begins with a line feed.
         reset_at_once: whether RE, RP and RT reset now, rather than set what R and power-up do.
         halt_waits: whether H answers once the axes stand, rather than at once; the sources do not say.
-        expansion: whether the unit has the ports A and B.
-        slip_ring: whether it can turn without end.
         greeting: text for a new TCP client; empty for a plain serial line.
         wording: of the replies.
     """
 
-    name: str
     version: tuple[int, int, int]
     title: str
     step: float
@@ -108,10 +104,13 @@ class UnitProfile:
     leading_lf: bool = False
     reset_at_once: bool = False
     halt_waits: bool = False
-    expansion: bool = False
-    slip_ring: bool = False
     greeting: str = ""
     wording: Wording = Wording()
+
+    @property
+    def resolution(self) -> str:
+        """Resolution in replies [arc seconds]."""
+        return f"{self.step:.{self.resolution_digits}f}"
 
     @property
     def banner(self) -> str:
@@ -120,13 +119,7 @@ class UnitProfile:
 
     @classmethod
     def from_degrees(
-        cls,
-        pan: tuple[float, float],
-        tilt: tuple[float, float],
-        step: float,
-        speed: float,
-        acceleration: float,
-        name: str = "d46_sim",
+        cls, pan: tuple[float, float], tilt: tuple[float, float], step: float, speed: float, acceleration: float
     ) -> "UnitProfile":
         """Make a profile of a head whose range is known in degrees, such as a simulated rig's.
 
@@ -139,7 +132,6 @@ class UnitProfile:
             step: resolution of both axes [degrees].
             speed: highest speed, and speed of moves at power-up [degrees/s].
             acceleration: of both axes [degrees/s^2].
-            name: of the profile.
 
         Raises:
             ConfigError: the step is not positive, or the range has too many steps for such a unit.
@@ -152,9 +144,8 @@ class UnitProfile:
 
         fastest = max(round(speed / step), 1)
         return cls(
-            name=name,
-            version=(2, 14, 0),
-            title="Pan-Tilt Controller v2.14.0(C14/E), (C)2006 Directed Perception, Inc., All Rights Reserved",
+            version=D46_STOCK.version,
+            title=D46_STOCK.title,
             step=step * ARCSEC,
             resolution_digits=6,
             pan=counts(pan),
@@ -172,7 +163,6 @@ class UnitProfile:
 
 # A PTU-D46-17.5 with factory settings: half steps, limits of the examples in S1 and S2.
 D46_STOCK = UnitProfile(
-    name="d46_stock",
     version=(2, 14, 0),
     title="Pan-Tilt Controller v2.14.0(C14/E), (C)2006 Directed Perception, Inc., All Rights Reserved",
     step=185.1428,
@@ -182,7 +172,6 @@ D46_STOCK = UnitProfile(
 # The paper's range, +-180 and -80..+30 degrees, which needs the extended-range option. An older firmware: where S1 and
 # S2 differ it has S2's wording, that of units which the drivers CARMEN and ASR met, and MRPT's refusal of a number.
 D46_PAPER = UnitProfile(
-    name="d46_paper",
     version=(2, 12, 1),
     title="Pan-Tilt Controller v2.12.1d1(C14/E), (C)2003 Directed Perception, Inc., All Rights Reserved",
     step=185.1428,
@@ -202,7 +191,6 @@ D46_PAPER = UnitProfile(
 )
 # An E-series unit: eight steps to one of a D46.
 E_SERIES = UnitProfile(
-    name="e_series",
     version=(3, 2, 1),
     title="Pan-Tilt Controller v3.2.1(E46), (C)2011 FLIR Commercial Systems, Inc., All Rights Reserved",
     step=23.142857,
@@ -234,15 +222,12 @@ E_SERIES = UnitProfile(
         regular="REG",
     ),
 )
-PROFILES = {unit.name: unit for unit in (D46_STOCK, D46_PAPER, E_SERIES)}
 
 
 # Axes
 
 # Stands for "at once": a stepper motor needs no ramp up to its base speed [steps/s^2].
 INSTANT = 1e6
-# Positions in a half step, by the step mode of W: full, half, quarter, eighth, automatic (which counts eighth steps).
-FINENESS = {"F": 0.5, "H": 1.0, "Q": 2.0, "E": 4.0, "A": 4.0}
 # A command that takes time: yields text to print meanwhile, "" for nothing yet, and returns its answer.
 Task = Generator[str, None, str]
 
@@ -275,7 +260,7 @@ def plain_acceleration(distance: float, speed: float, base: float, acceleration:
 
 @dataclass
 class AxisSettings:
-    """Settings of an axis, which DS saves; in positions of its step mode, and seconds."""
+    """Settings of an axis, which DS saves; in steps and seconds."""
 
     speed: int
     acceleration: int
@@ -284,9 +269,8 @@ class AxisSettings:
     lower: int
     user_lowest: int
     user_highest: int
-    hold: str = "REGULAR"
-    move: str = "REGULAR"
-    step_mode: str = "H"
+    hold: str = "R"
+    move: str = "R"
 
 
 class UnitAxis:
@@ -294,9 +278,9 @@ class UnitAxis:
 
     Args:
         name: "Pan" or "Tilt".
-        plant: mechanics of the axis, in half steps.
+        plant: mechanics of the axis, in the unit's steps.
         unit: profile of the unit.
-        limits: lowest and highest position that a reset finds [half steps].
+        limits: lowest and highest position that a reset finds [steps].
     """
 
     def __init__(self, name: str, plant: AxisPlant, unit: UnitProfile, limits: Range) -> None:
@@ -309,7 +293,6 @@ class UnitAxis:
         self.calibrated = True
         self.pending: int | None = None  # goal that waits for A or I
         self.velocity = 0  # commanded, in pure velocity mode
-        self.endless = False  # continuous pan of a slip ring
         self._unit = unit
         self._limits = limits
         self._goal: int | None = None  # None after a halt
@@ -317,34 +300,14 @@ class UnitAxis:
         self._into_stop = 0  # direction in which the present move meets a stop
 
     @property
-    def fineness(self) -> float:
-        """Number of positions in a half step."""
-        return FINENESS[self.settings.step_mode]
-
-    @property
-    def resolution(self) -> float:
-        """Size of a position [arc seconds]."""
-        return self._unit.step / self.fineness
-
-    @property
-    def factory_limits(self) -> Range:
+    def limits(self) -> Range:
         """Lowest and highest position that the reset found; both 0 before a reset."""
-        if not self.calibrated:
-            return 0, 0
-        if self.endless:
-            turn = round(360 * 3600 / self.resolution)
-            return 1 - turn, turn
-        return int(self._limits[0] * self.fineness), int(self._limits[1] * self.fineness)
+        return self._limits if self.calibrated else (0, 0)
 
     @property
     def position(self) -> int:
         """Position by the unit's own count."""
-        return round(self.plant.position() * self.fineness) + self._shift
-
-    @property
-    def speed(self) -> float:
-        """Present speed, signed [positions/s]."""
-        return self.plant.speed() * self.fineness
+        return self.plant.position() + self._shift
 
     @property
     def desired(self) -> int:
@@ -353,10 +316,6 @@ class UnitAxis:
             return self.pending
         return self.position if self._goal is None else self._goal
 
-    def moving(self) -> bool:
-        """Return whether the axis moves, or is about to."""
-        return self.plant.moving()
-
     def go(self, goal: int, speed: int | None = None) -> None:
         """Move to a position, even during a move; a stop on the way is hit."""
         self._goal, self.pending = goal, None
@@ -364,88 +323,84 @@ class UnitAxis:
 
     def change_speed(self) -> None:
         """Continue the present move at the speed that is set now."""
-        if self._goal is not None and self.moving():
+        if self._goal is not None and self.plant.moving():
             self._set_out(self._goal, self.settings.speed)
 
     def drive(self, velocity: int, limits: Range | None) -> None:
         """Turn at a signed speed, up to the limit or, without one, to the stop; 0 halts."""
         self.velocity = velocity
+        side = velocity > 0
         if velocity == 0:
             self.halt()
-            return
-        side = velocity > 0
-        if limits is not None:
+        elif limits is not None:
             self.go(limits[side], abs(velocity))
         else:  # a step beyond the stop, so that it is hit
-            past = self._stops()[side] + (1 if side else -1)
-            self.go(round(past * self.fineness) + self._shift, abs(velocity))
+            self.go(self._stops()[side] + (1 if side else -1) + self._shift, abs(velocity))
 
     def halt(self) -> None:
         """Brake, and drop the goal."""
-        speed, base, acceleration = abs(self.speed), self.settings.base, float(self.settings.acceleration)
+        speed, base, acceleration = abs(self.plant.speed()), self.settings.base, float(self.settings.acceleration)
         if 0 < base < speed:  # gives the braking distance of a motor that stops at its base speed
             acceleration *= speed**2 / (speed**2 - base**2)
         elif base >= speed:
             acceleration = INSTANT if base else acceleration
         self._goal = self.pending = None
         self._into_stop = 0
-        self.plant.halt(min(acceleration / self.fineness, INSTANT))
+        self.plant.halt(min(acceleration, INSTANT))
 
     def stopped_at_stop(self) -> bool:
         """Return whether the present move has just hit its stop, and lose steps there."""
-        if not self._into_stop or self.moving():
+        if not self._into_stop or self.plant.moving():
             return False
         self.lose_steps(self._into_stop)
         return True
 
     def lose_steps(self, direction: int) -> None:
         """Stop at an obstacle: the count goes on in ``direction``, the axis does not."""
-        self.plant.halt(INSTANT)
-        self._goal = self.pending = None
-        self._into_stop = self.velocity = 0
+        self._stop()
         self._shift += direction * self._unit.slip
 
     def lose_power(self) -> None:
         """Stop, and count the present position as 0."""
-        self.plant.halt(INSTANT)
-        self._goal = self.pending = None
-        self._into_stop = self.velocity = 0
-        self.calibrated = self.endless = False
-        self._shift = 0
-        self._shift = -self.position
+        self._stop()
+        self.calibrated = False
+        self._shift = -self.plant.position()
 
     def reset(self) -> Task:
         """Run into both stops, set the limits from them, and go to 0."""
-        self.velocity = 0
+        self.velocity = self._into_stop = 0
         for stop in self._stops():
             self._send(stop, self._unit.reset_speed)
-            while self.moving():
+            while self.plant.moving():
                 yield ""
             yield f"!{self.letter}"
-        self._shift, self._goal, self.pending, self._into_stop = 0, 0, None, 0
-        self.calibrated = True
+        self._shift, self._goal, self.pending, self.calibrated = 0, 0, None, True
         self._send(0, self._unit.reset_speed)
-        while self.moving():
+        while self.plant.moving():
             yield ""
         return ""
 
+    def _stop(self) -> None:
+        self.plant.halt(INSTANT)
+        self._goal = self.pending = None
+        self._into_stop = self.velocity = 0
+
     def _stops(self) -> Range:
-        """Return the positions of the mechanical stops [half steps]."""
+        """Return the true positions of the mechanical stops."""
         margin = self._unit.stop_margin
         return self._limits[0] - margin, self._limits[1] + margin
 
     def _set_out(self, goal: int, speed: int) -> None:
-        """Move at a speed [positions/s] to a position by the unit's count, or to the stop before it."""
-        aim = (goal - self._shift) / self.fineness
-        lowest, highest = (-math.inf, math.inf) if self.endless else self._stops()
+        """Move to a position by the unit's count, or to the stop before it."""
+        aim, (lowest, highest) = goal - self._shift, self._stops()
         self._into_stop = (aim > highest) - (aim < lowest)
-        self._send(min(max(aim, lowest), highest), speed / self.fineness)
+        self._send(min(max(aim, lowest), highest), speed)
 
-    def _send(self, aim: float, speed: float) -> None:
-        """Command the plant, in half steps and half steps/s."""
-        acceleration, base = self.settings.acceleration / self.fineness, self.settings.base / self.fineness
-        distance = abs(aim - self.plant.position())
-        self.plant.command(round(aim), speed, plain_acceleration(distance, speed, base, acceleration))
+    def _send(self, aim: int, speed: int) -> None:
+        """Command the plant to a true position."""
+        settings, distance = self.settings, abs(aim - self.plant.position())
+        acceleration = plain_acceleration(distance, speed, settings.base, settings.acceleration)
+        self.plant.command(aim, speed, acceleration)
 
 
 # The unit
@@ -464,23 +419,21 @@ class Settings:
     Attributes:
         pan: of the pan axis.
         tilt: of the tilt axis.
-        echo: whether the unit echoes every character.
-        verbose: whether replies to queries are sentences.
+        echo: "E" if the unit echoes every character, or "D".
+        feedback: "V" if replies to queries are sentences, "T" for terse ones.
         limits: "E" for the factory's, "D" for none, "U" for the user's.
-        reset: axes that R and power-up reset, of "PT".
+        reset: axes that R and power-up reset: "E" for both, "P", "T", or "D" for none.
         immediate: whether positions are executed at once, rather than on A or I.
-        scan_at_power_up: whether the unit begins to scan at power-up.
         network_id: number on a shared line; 0 for a unit that is alone on its line.
     """
 
     pan: AxisSettings
     tilt: AxisSettings
-    echo: bool = True
-    verbose: bool = True
+    echo: str = "E"
+    feedback: str = "V"
     limits: str = "E"
-    reset: str = "PT"
+    reset: str = "E"
     immediate: bool = True
-    scan_at_power_up: bool = False
     network_id: int = 0
 
 
@@ -488,15 +441,14 @@ class Unit:
     """State of a unit, with the operations that several commands use.
 
     Args:
-        pan: mechanics of pan, in half steps.
-        tilt: mechanics of tilt, in half steps.
+        pan: mechanics of pan, in the unit's steps.
+        tilt: mechanics of tilt, in the unit's steps.
         profile: of the unit.
         now: returns the unit's time [s].
     """
 
     def __init__(self, pan: AxisPlant, tilt: AxisPlant, profile: UnitProfile, now: Callable[[], float]) -> None:
-        self.profile = profile
-        self.now = now
+        self.profile, self.wording, self.now = profile, profile.wording, now
         self.pan = UnitAxis("Pan", pan, profile, profile.pan)
         self.tilt = UnitAxis("Tilt", tilt, profile, profile.tilt)
         self.settings = Settings(self.pan.settings, self.tilt.settings)
@@ -504,9 +456,6 @@ class Unit:
         self._saved = copy.deepcopy(self.settings)
         self.velocity_mode = False
         self.selected = True  # whether commands on a shared line are for this unit
-        self.routed = False  # whether the line is connected to an expansion port
-        self.presets: dict[int, tuple[int, int]] = {}
-        self.scan: list[Task] = []  # tasks of the autoscan, one for each axis
         self.baud = self.baud_at_power_up = BAUD
         self.byte_delay_s = 0.0
 
@@ -515,24 +464,18 @@ class Unit:
         """Pan and tilt axis."""
         return self.pan, self.tilt
 
-    def axis(self, letter: str) -> UnitAxis:
-        """Return the axis of the letter P or T."""
-        return self.pan if letter == "P" else self.tilt
-
-    def say(self, sentence: str, axis: UnitAxis, n: int) -> str:
-        """Make the answer to a query of a number."""
-        return sentence.format(axis=axis.name, n=n) if self.settings.verbose else str(n)
+    def say(self, sentence: str, axis: UnitAxis, value: object) -> str:
+        """Make the answer to a query, a sentence or the value alone."""
+        return sentence.format(axis=axis.name, n=value) if self.settings.feedback == "V" else str(value)
 
     def limits(self, axis: UnitAxis) -> Range | None:
         """Return the positions allowed now; None if all are."""
-        match self.settings.limits, axis.calibrated:
-            case "D", _:
-                return None
-            case "U", True:
-                lowest, highest = axis.factory_limits
-                return max(lowest, axis.settings.user_lowest), min(highest, axis.settings.user_highest)
-            case _:
-                return axis.factory_limits
+        if self.settings.limits == "D":
+            return None
+        lowest, highest = axis.limits
+        if self.settings.limits == "U" and axis.calibrated:
+            return max(lowest, axis.settings.user_lowest), min(highest, axis.settings.user_highest)
+        return lowest, highest
 
     def move(self, axis: UnitAxis, goal: int) -> str:
         """Go to a position, now or on A or I.
@@ -540,16 +483,13 @@ class Unit:
         Raises:
             RefusalError: the position is beyond a limit, or the unit is in pure velocity mode.
         """
-        wording, limits = self.profile.wording, self.limits(axis)
+        limits = self.limits(axis)
         if self.velocity_mode:
-            raise RefusalError(wording.illegal)
+            raise RefusalError(self.wording.illegal)
         if limits is not None:
-            if not axis.calibrated and wording.uncalibrated is not None:
-                raise RefusalError(wording.uncalibrated)
-            if goal > limits[1]:
-                raise RefusalError(f"Maximum allowable {axis.name} position is {limits[1]}")
-            if goal < limits[0]:
-                raise RefusalError(f"Minimum allowable {axis.name} position is {limits[0]}")
+            if not axis.calibrated and self.wording.uncalibrated is not None:
+                raise RefusalError(self.wording.uncalibrated)
+            refuse_beyond(axis, goal, limits)
         if self.settings.immediate:
             axis.go(goal)
         else:
@@ -565,7 +505,7 @@ class Unit:
         upper, lower = axis.settings.upper, max(axis.settings.lower, 1)
         size = abs(speed) if self.velocity_mode else speed
         if size > upper:
-            raise RefusalError(self.profile.wording.too_fast.format(axis=axis.name, n=upper))
+            raise RefusalError(self.wording.too_fast.format(axis=axis.name, n=upper))
         if size < lower and not (self.velocity_mode and speed == 0):
             raise RefusalError(f"Motor speed cannot be less than {lower} pos/sec")
         if self.velocity_mode:
@@ -588,46 +528,32 @@ class Unit:
             if axis.pending is not None:
                 axis.go(axis.pending)
 
-    def standing(self, axes: Iterable[UnitAxis]) -> Task:
+    def standing(self, *axes: UnitAxis) -> Task:
         """Wait until the axes stand."""
-        waited = tuple(axes)
-        while any(axis.moving() for axis in waited):
+        while any(axis.plant.moving() for axis in axes):
             yield ""
         return ""
 
-    def compute_tables(self, axis: UnitAxis, change: Callable[[], None]) -> Task:
-        """Apply a change that is not possible during a move: wait until the axis stands, then for the tables."""
-        yield from self.standing([axis])
+    def change(self, axis: UnitAxis, name: str, value: int) -> Task:
+        """Set an axis's bound or acceleration: wait until the axis stands, then for the tables.
+
+        The desired speed is clipped to the bounds.
+        """
+        yield from self.standing(axis)
         ready = self.now() + self.profile.tables_s
         while self.now() < ready:
             yield ""
-        change()
+        settings = axis.settings
+        setattr(settings, name, value)
+        settings.speed = min(max(settings.speed, settings.lower), settings.upper)
         return ""
 
-    def reset(self, letters: str) -> Task:
-        """Find the limits of the named axes, tilt first, as the replies of real units show."""
+    def reset(self, which: str) -> Task:
+        """Find the limits of both axes ("E"), of one ("P", "T") or none, tilt first, as real units' replies show."""
         for axis in (self.tilt, self.pan):
-            if axis.letter in letters:
+            if which in ("E", axis.letter):
                 yield from axis.reset()
         return ""
-
-    def start_scan(self, ranges: dict[str, Range]) -> None:
-        """Move each named axis back and forth between two positions, until `end_scan`."""
-
-        def sweep(axis: UnitAxis, ends: Range) -> Task:
-            while True:
-                for end in ends:
-                    axis.go(end)
-                    yield from self.standing([axis])
-                    yield ""
-
-        self.scan = [sweep(self.axis(letter), ends) for letter, ends in ranges.items()]
-
-    def end_scan(self) -> None:
-        """Stop the scan and go to 0."""
-        self.scan = []
-        for axis in self.axes:
-            axis.go(0)
 
     def save(self) -> None:
         """Save the settings for the next power-up."""
@@ -640,11 +566,23 @@ class Unit:
         self.set_velocity_mode(False)
 
     def lose_power(self) -> None:
-        """Simulate a power failure: all state but the saved settings is lost, including the position."""
+        """Lose all state but the saved settings, including the position."""
         self.velocity_mode = False
         self.restore()
-        self.selected, self.routed = self.settings.network_id == 0, False
-        self.scan = []
+        self.selected = self.settings.network_id == 0
         self.baud, self.byte_delay_s = self.baud_at_power_up, 0.0
         for axis in self.axes:
             axis.lose_power()
+
+
+def refuse_beyond(axis: UnitAxis, goal: int, limits: Range) -> None:
+    """Refuse a position beyond limits.
+
+    Raises:
+        RefusalError: the position is beyond one; the message names it.
+    """
+    lowest, highest = limits
+    if goal > highest:
+        raise RefusalError(f"Maximum allowable {axis.name} position is {highest}")
+    if goal < lowest:
+        raise RefusalError(f"Minimum allowable {axis.name} position is {lowest}")
