@@ -8,6 +8,7 @@ import shutil
 import threading
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import cv2
@@ -68,37 +69,26 @@ def old(tmp_path, monkeypatch):
 
 
 def test_v010_calibration_loads():
+    """That all of it is written again as it was is tested below."""
     then, found = read(OLD / "calibration.json"), load_calibration(OLD / "calibration.json")
-    assert found.fixed.size == (640, 480)
+    lens, head = found.zoom_head.lens, found.zoom_head
     assert found.fixed.lens.focal_px == (then["fixed"]["fx"], then["fixed"]["fy"])
     assert found.fixed.lens.center_px == (then["fixed"]["cx"], then["fixed"]["cy"])
     assert found.fixed.lens.distortion == tuple(then["fixed"]["distortion"])
-    assert found.zoom_head.lens.size == (320, 240)
-    assert found.zoom_head.lens.nominal_px == pytest.approx((1000 / 3, 2500 / 3))
-    assert found.zoom_head.lens.stops[1].focal_px[0] == then["zoom"]["stops"][1]["fx"]
-    assert found.zoom_head.lens.pupil == (0.0, then["zoom"]["stops"][1]["pupil"])
+    assert (found.fixed.size, lens.size, found.pitch_mm) == ((640, 480), (320, 240), 0.018)
+    assert lens.nominal_px == pytest.approx((1000 / 3, 2500 / 3))
+    assert (lens.stops[1].focal_px[0], lens.pupil[1]) == tuple(then["zoom"]["stops"][1][key] for key in ("fx", "pupil"))
     for name in ("T_zoom0_fixed", "T_head_zoom"):
-        T = getattr(found.zoom_head, name)
+        T = getattr(head, name)
         assert T.translation == pytest.approx(then[name]["translation"])
         assert np.degrees(T.rotation.as_rotvec()) == pytest.approx(then[name]["rotvec_deg"])
-    assert found.zoom_head.axes.axis_offset == then["head"]["axis_offset"]
-    assert math.degrees(found.zoom_head.axes.squareness) == pytest.approx(then["head"]["squareness_deg"])
-    assert (found.zoom_head.axes.pan_scale, found.zoom_head.axes.tilt_scale) == (1.0, 1.0)
-    assert (found.zoom_head.axes.pan_zero, found.zoom_head.axes.tilt_zero, found.pitch_mm) == (0.0, 0.0, 0.018)
-    assert math.degrees(found.jitter) == pytest.approx(then["head"]["jitter_deg"])
-    assert found.residuals.stereo_rms_px == then["residuals"]["stereo_rms_px"]
-    assert (found.residuals.fixed_views, found.residuals.zoom_views, found.residuals.pairs) == (13, 18, 6)
+    assert head.axes.axis_offset == then["head"]["axis_offset"]
+    assert np.degrees([head.axes.squareness, found.jitter]) == pytest.approx(
+        [then["head"]["squareness_deg"], then["head"]["jitter_deg"]]
+    )
     assert len(found.residuals.rejected) == 6
-    assert found.residuals.rejected[0].name == "0022_fixed_board09.png"
-    assert found.covariance.parameters[:2] == ("fixed.fx", "fixed.fy")
     assert np.array_equal(found.covariance.matrix, then["covariance"]["matrix"])
-    assert (found.held_out.views, found.held_out.widened) == (18, 1.0)
-    assert (found.board.kind, found.board.corners, found.board.square) == ("chessboard", (9, 6), 0.1)
-    assert found.board_warp == tuple(then["board_warp"])
-    assert (found.provenance["method"], found.provenance["images"]) == ("joint", 37)
     for view, table in zip(found.views, then["views"], strict=True):
-        assert (view.camera, view.board, view.source) == (table["camera"], table["board"], table["source"])
-        assert (view.pan, view.tilt, view.t, view.focal_px) == tuple(table[k] for k in ("pan", "tilt", "t", "focal_px"))
         corners = [(math.nan, math.nan) if corner is None else corner for corner in table["corners_px"]]
         assert np.array_equal(view.corners_px, corners, equal_nan=True)
     assert any(not view.seen.all() for view in found.views)  # a corner that is not seen is null
@@ -321,81 +311,41 @@ NEW_KEYS = {"skipped", "started", "states.unconfirmed"}  # of follow and replay,
 NEW_COLUMNS = ["utc", "skipped"]  # of follow.csv
 
 
-class Fake:
+def fake_rig(failing):
     """A rig whose devices answer the same in every run; its lens first fails with the given errors."""
+    now, failing = [100.0], list(failing)
 
-    real_time = True
+    def read(newer_than=None, timeout=1.0):
+        now[0] += 0.25
+        return Frame(np.full((3, 4, 3), int(now[0]), np.uint8), now[0] - 0.125)
 
-    def __init__(self, failing=()):
-        self.t, self.failing = 100.0, list(failing)
-        self.fixed, self.zoom, self.head, self.clock = FakeFixed(self), FakeZoom(self), FakeHead(self), FakeClock(self)
-        self.board = FakeBoard()
+    def lens():
+        if failing:
+            raise failing.pop(0)
+        return ZoomState(300.0, False, now[0])
 
-    def close(self):
-        self.head.halt()
+    def sleep_until(t):
+        now[0] = max(now[0], t)
 
+    def nothing(*_):
+        pass
 
-class FakeFixed:
-    size = (4, 3)
-
-    def __init__(self, rig):
-        self.rig = rig
-
-    def read(self, newer_than=None, timeout=1.0):
-        self.rig.t += 0.25
-        width, height = self.size
-        return Frame(np.full((height, width, 3), int(self.rig.t), np.uint8), self.rig.t - 0.125)
-
-
-class FakeZoom(FakeFixed):
-    still_size, focal_range = (8, 6), (100.0, 1200.0)
-
-    def capture(self):
-        return Frame(np.full((6, 8, 3), 7, np.uint8), self.rig.t - 0.0625)
-
-    def zoom(self, focal_px):
-        return min(focal_px, self.focal_range[1])
-
-    def state(self):
-        if self.rig.failing:
-            raise self.rig.failing.pop(0)
-        return ZoomState(300.0, False, self.rig.t)
-
-
-class FakeHead:
     limits = PanTiltLimits((-2.5, 2.5), (-0.75, 0.5), math.inf, 4.0, 0.0)
-
-    def __init__(self, rig):
-        self.rig = rig
-
-    def move(self, pan, tilt, speed=None, wait=False):
-        return pan, min(tilt, self.limits.tilt[1])
-
-    def state(self):
-        return PanTiltState(0.125, -0.25, True, self.rig.t)
-
-    def halt(self):
-        pass
-
-
-class FakeClock:
-    def __init__(self, rig):
-        self.rig = rig
-
-    def now(self):
-        return self.rig.t
-
-    def sleep_until(self, t):
-        self.rig.t = max(self.rig.t, t)
-
-
-class FakeBoard:
-    patience = 0.0
-
-    def present(self, T_fixed_board):
-        pass
-
-    swing = present
+    return SimpleNamespace(
+        real_time=True,
+        fixed=SimpleNamespace(size=(4, 3), read=read),
+        zoom=SimpleNamespace(
+            size=(4, 3), still_size=(8, 6), focal_range=(100.0, 1200.0), read=read, state=lens,
+            zoom=lambda focal_px: min(focal_px, 1200.0),
+            capture=lambda: Frame(np.full((6, 8, 3), 7, np.uint8), now[0] - 0.0625),
+        ),
+        head=SimpleNamespace(
+            limits=limits, halt=nothing, state=lambda: PanTiltState(0.125, -0.25, True, now[0]),
+            move=lambda pan, tilt, speed=None, wait=False: (pan, min(tilt, limits.tilt[1])),
+        ),
+        clock=SimpleNamespace(now=lambda: now[0], sleep_until=sleep_until),
+        board=SimpleNamespace(patience=0.0, present=nothing, swing=nothing),
+    )  # fmt: skip
 
 
 class SilentError(DeviceError):
@@ -419,21 +369,17 @@ def every_call(rig):
     yield rig.zoom.read(timeout=0.25).t
     yield rig.zoom.capture().image.shape
     yield rig.zoom.zoom(2000.0)
-    yield tuple(vars_of(rig.zoom.state()))
+    yield dataclasses.astuple(rig.zoom.state())
     yield rig.head.move(0.1, 0.75)
     yield rig.head.move(0.1, 0.25, 0.5)
     yield rig.head.move(0.1, 0.25, (0.5, 0.25), wait=True)
-    yield tuple(vars_of(rig.head.state()))
+    yield dataclasses.astuple(rig.head.state())
     yield rig.head.halt()
     yield rig.clock.sleep_until(102.0)
     yield rig.clock.now()
     yield rig.board.present(T)
     yield rig.board.present(None)
     yield rig.board.swing(T)
-
-
-def vars_of(state):
-    return dataclasses.astuple(state)
 
 
 def record_every_call(folder):
@@ -446,7 +392,7 @@ def record_every_call(folder):
     ]
     with (
         Recorder(folder, config, OLD / "calibration_plain.json", "bird") as recorder,
-        recorder.wrap(rig_of(Fake(failures))) as rig,
+        recorder.wrap(rig_of(fake_rig(failures))) as rig,
     ):
         answers = list(every_call(rig))
         aside = threading.Thread(target=rig.head.halt)
