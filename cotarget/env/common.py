@@ -1,4 +1,4 @@
-"""Share what both environments need: checked arguments, units of actions, the episode's world, and its pictures."""
+"""Base of both environments: checked arguments, units of actions, the episode's world, and its pictures."""
 
 import math
 import reprlib
@@ -44,25 +44,32 @@ DEFAULT_RIG = RigConfig(
 )
 
 
-def shortened(given: object) -> str:
-    """Format a given value for messages, on one line and shortened."""
-    return " ".join(reprlib.repr(given).split())
+def require(ok: bool, what: str, given: object, wanted: str) -> None:
+    """Refuse an argument in one line unless it is what is wanted.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if not ok:
+        raise ConfigError(f"{what}: {' '.join(reprlib.repr(given).split())} is not {wanted}")
 
 
-def name_of(what: str, given: object, known: Collection[str]) -> str:
+def one_of(what: str, given: str, known: Collection[str]) -> str:
     """Check that a name is a known one.
 
     Raises:
         ConfigError: it is unknown.
     """
-    if isinstance(given, str) and given in known:
-        return given
-    raise ConfigError(
-        f"{what}: unknown {shortened(given)}; there {'are' if len(known) > 1 else 'is'}: {choices(known)}"
-    )
+    require(isinstance(given, str) and given in known, what, given, f"one of: {choices(known)}")
+    return given
 
 
-def rig_of(given: object) -> RigConfig:
+def number_in(given: object, low: float, high: float) -> bool:
+    """Whether an argument is a finite number above the lowest and up to the highest value."""
+    return isinstance(given, Real) and low < float(given) <= high and math.isfinite(given)
+
+
+def rig_of(given: RigConfig | Path | str | None) -> RigConfig:
     """Resolve a simulated rig: a configuration, its rig.toml, or None for the default one.
 
     The soft limits become those of its head.
@@ -73,8 +80,7 @@ def rig_of(given: object) -> RigConfig:
     if isinstance(given, Path | str):
         given = load_config(Path(given))
     config = DEFAULT_RIG if given is None else given
-    if not isinstance(config, RigConfig):
-        raise ConfigError(f"rig: {shortened(given)} is neither a cotarget.config.RigConfig nor the path of a rig.toml")
+    require(isinstance(config, RigConfig), "rig", given, "a cotarget.config.RigConfig or the path of a rig.toml")
     if config.backend != "sim":
         raise ConfigError(f"rig: its backend is '{config.backend}'; environments are on 'sim' alone")
     if given is not None:
@@ -127,83 +133,6 @@ def check_scene(sim: SimConfig, name: str, paths: Callable[[str, int], Mapping[s
         )
 
 
-def calibration_of(given: object) -> Calibration | None:
-    """Resolve a calibration: one, its file, or None.
-
-    Raises:
-        ConfigError: it is something else.
-        CalibrationError: the file is no calibration.
-    """
-    if isinstance(given, Path | str):
-        return load_calibration(Path(given))
-    if given is None or isinstance(given, Calibration):
-        return given
-    raise ConfigError(
-        f"calibration: {shortened(given)} is neither a cotarget.calibration.Calibration nor the path of one"
-    )
-
-
-def noise_of(given: object) -> TruthNoise:
-    """Check the noise of the detections.
-
-    Raises:
-        ConfigError: it is no `TruthNoise`.
-    """
-    if isinstance(given, TruthNoise):
-        return given
-    raise ConfigError(f"noise: {shortened(given)} is no cotarget.evaluation.TruthNoise")
-
-
-def seconds_of(given: object) -> float:
-    """Check the length of an episode [s].
-
-    Raises:
-        ConfigError: it is not positive, or longer than the targets' paths.
-    """
-    if isinstance(given, Real) and 0 < float(given) <= SECONDS:
-        return float(given)
-    raise ConfigError(
-        f"seconds: {shortened(given)} is not above 0 and up to {SECONDS:g}, as long as the targets' paths"
-    )
-
-
-def size_of(given: object) -> Size:
-    """Check the size of pictures, (width, height) [px].
-
-    Raises:
-        ConfigError: it is no such size.
-    """
-    size = tuple(given) if isinstance(given, list | tuple) else ()
-    whole = all(isinstance(side, int | np.integer) and SMALLEST_PX <= side <= LARGEST_PX for side in size)
-    if len(size) != 2 or not whole:
-        raise ConfigError(
-            f"image_size: {shortened(given)} is not (width, height) of {SMALLEST_PX} to {LARGEST_PX} pixels each"
-        )
-    return int(size[0]), int(size[1])
-
-
-def reward_of(given: object) -> float:
-    """Check a reward.
-
-    Raises:
-        ConfigError: it is no finite number.
-    """
-    if isinstance(given, Real) and math.isfinite(given):
-        return float(given)
-    raise ConfigError(f"served_reward: {shortened(given)} is not a finite number")
-
-
-def check_options(given: object) -> None:
-    """Refuse options of an episode; there are none.
-
-    Raises:
-        ConfigError: there is one.
-    """
-    if given is not None and not (isinstance(given, Mapping) and not given):
-        first = next(iter(given)) if isinstance(given, Mapping) else given
-        raise ConfigError(f"options: reset knows no {shortened(first)}; it takes a seed only")
-
-
 # Commands and states as numbers from -1 to 1
 
 Vector = npt.NDArray[np.float32]
@@ -254,8 +183,8 @@ class Units:
             given = np.asarray(action, dtype=float)
         except (TypeError, ValueError):
             given = np.empty(0)
-        if given.shape != (3,) or not all(map(math.isfinite, given.tolist())):
-            raise ConfigError(f"action: {shortened(action)} is not three finite numbers, of pan, tilt and focal length")
+        finite = given.shape == (3,) and all(map(math.isfinite, given.tolist()))
+        require(finite, "action", action, "three finite numbers, of pan, tilt and focal length")
         parts = [(min(max(number, -1.0), 1.0) + 1) / 2 for number in given.tolist()]
         (low_pan, high_pan), (low_tilt, high_tilt), (short, long) = self.pan, self.tilt, self.focal_px
         return (
@@ -350,6 +279,16 @@ class Episode:
         way = self._to_fixed @ (self.outlines.center(name, t) - self._eye)
         return way / math.sqrt(way @ way)
 
+    def box(self, name: str, camera: CameraName, t: float) -> Array:
+        """Left, top, right and bottom of a target's box [px], (4,); infinite behind the camera."""
+        box = self.outlines.box(name, camera, t)
+        return np.full(4, np.inf) if box is None else np.concatenate(box)
+
+
+def _is_side(given: object) -> bool:
+    """Whether a picture may have a side of that length [px]."""
+    return isinstance(given, int | np.integer) and bool(SMALLEST_PX <= given <= LARGEST_PX)
+
 
 class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
     """Base of the environments on the simulated rig; see `Follow` and `Schedule`.
@@ -376,16 +315,26 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         Raises:
             ConfigError: an argument is invalid.
         """
-        name_of("observation", observation, KINDS)
+        one_of("observation", observation, KINDS)
         if render_mode is not None:
-            name_of("render_mode", render_mode, self.metadata["render_modes"])
+            one_of("render_mode", render_mode, self.metadata["render_modes"])
+        if isinstance(calibration, Path | str):
+            calibration = load_calibration(Path(calibration))
+        own = isinstance(calibration, Calibration | None)
+        require(own, "calibration", calibration, "a cotarget.calibration.Calibration or the path of one")
+        lasts = f"above 0 and up to {SECONDS:g}, as long as the targets' paths"
+        require(number_in(seconds, 0.0, SECONDS), "seconds", seconds, lasts)
+        sides = isinstance(image_size, list | tuple) and len(image_size) == 2 and all(map(_is_side, image_size))
+        wanted = f"(width, height) of {SMALLEST_PX} to {LARGEST_PX} pixels each"
+        require(sides, "image_size", image_size, wanted)
+        require(isinstance(noise, TruthNoise), "noise", noise, "a cotarget.evaluation.TruthNoise")
         self.config = rig_of(rig)
         self.units = Units.of(self.config)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.config.sim.fixed.rate_hz}
-        self._calibration, self._noise = calibration_of(calibration), noise_of(noise)
-        self._observation, self._size = observation, size_of(image_size)
-        self._last = max(round(seconds_of(seconds) * self.config.sim.fixed.rate_hz), 1)
+        self._calibration, self._noise, self._observation = calibration, noise, observation
+        self._size = int(image_size[0]), int(image_size[1])
+        self._last = max(round(float(seconds) * self.config.sim.fixed.rate_hz), 1)
         self._episode: Episode | None = None
         self._opened: dict[Size, SizedPictures] = {}  # for the present episode
 
@@ -433,7 +382,8 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         Raises:
             ConfigError: options are given; there are none.
         """
-        check_options(options)
+        none = options is None or (isinstance(options, Mapping) and not options)
+        require(none, "options", options, "empty: reset takes a seed only")
         super().reset(seed=seed)
         return int(self.np_random.integers(2**31))
 
@@ -470,8 +420,3 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         names: tuple[CameraName, ...] = ("fixed", "zoom")
         images = [pictures.take(name, t) for name, t in zip(names, self.times, strict=True)]
         return [np.ascontiguousarray(image[:, :, ::-1]) for image in images]
-
-
-def corners(box: tuple[Array, Array] | None) -> Array:
-    """Left, top, right and bottom of a box [px], (4,); infinite if there is none."""
-    return np.full(4, np.inf) if box is None else np.concatenate(box)

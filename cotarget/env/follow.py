@@ -20,8 +20,7 @@ from cotarget.env.common import (
     Vector,
     box,
     check_scene,
-    corners,
-    name_of,
+    one_of,
     rig_numbers,
     within,
 )
@@ -100,7 +99,7 @@ class Follow(RigEnv[Any, Vector]):
         Raises:
             ConfigError: an argument is invalid.
         """
-        self.name = name_of("target", target, LONE)
+        self.name = one_of("target", target, LONE)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
         check_scene(self.config.sim, target, lone_path)
         self.target = self.profile_of(target)
@@ -188,7 +187,7 @@ class Follow(RigEnv[Any, Vector]):
 
     def _info(self, judged: Closeup) -> dict[str, Any]:
         """Collect the ground truth."""
-        (t, t_closeup), outlines = self.times, self.episode.outlines
+        t, t_closeup = self.times
         return {
             "t": t,
             "t_closeup": t_closeup,
@@ -197,7 +196,7 @@ class Follow(RigEnv[Any, Vector]):
             "offset_px": judged.tpo_px,
             "size_ratio": judged.size_ratio,
             "center_px": np.full(2, np.inf) if math.isnan(judged.u_px) else np.array([judged.u_px, judged.v_px]),
-            "box_closeup": corners(outlines.box(self.name, "zoom", t_closeup)),
-            "box_wide": corners(outlines.box(self.name, "fixed", t)),
+            "box_closeup": self.episode.box(self.name, "zoom", t_closeup),
+            "box_wide": self.episode.box(self.name, "fixed", t),
             "direction": self.episode.direction(self.name, t),
         }

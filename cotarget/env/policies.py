@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 from cotarget.control.head import HeadCommand, HeadModel, axis_at
 from cotarget.control.selection import POLICIES
 from cotarget.detection import Detection
-from cotarget.env.common import Command, Episode, Vector, name_of
+from cotarget.env.common import Command, Episode, Vector, one_of
 from cotarget.env.follow import Follow
 from cotarget.env.schedule import Schedule
 from cotarget.errors import ConfigError
@@ -190,7 +190,7 @@ class SchedulingPolicy:
         """
         if not isinstance(env.unwrapped, Schedule):
             raise ConfigError(f"env: policies choose in cotarget/Schedule-v0, and not in {env.unwrapped}")
-        self._env, self._make = env.unwrapped, POLICIES[name_of("policy", policy, POLICIES)]
+        self._env, self._make = env.unwrapped, POLICIES[one_of("policy", policy, POLICIES)]
         self._episode: Episode | None = None
 
     def __call__(self, observation: object) -> int:

@@ -19,14 +19,12 @@ from cotarget.env.common import (
     RigEnv,
     box,
     check_scene,
-    corners,
-    name_of,
-    reward_of,
+    number_in,
+    one_of,
+    require,
     rig_numbers,
-    shortened,
     within,
 )
-from cotarget.errors import ConfigError
 from cotarget.evaluation import TruthNoise, closeup_of
 from cotarget.geometry import Array
 from cotarget.metrics import ROUNDING_S, SERVED_S
@@ -133,10 +131,11 @@ class Schedule(RigEnv[dict[str, Any], int]):
         Raises:
             ConfigError: an argument is invalid.
         """
-        self.kind = name_of("kind", kind, GROUPED)
+        self.kind = one_of("kind", kind, GROUPED)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
         check_scene(self.config.sim, kind, group_paths)
-        self.target, self._served_reward = self.profile_of(kind), reward_of(served_reward)
+        require(number_in(served_reward, -math.inf, math.inf), "served_reward", served_reward, "a finite number")
+        self.target, self._served_reward = self.profile_of(kind), float(served_reward)
         self._rig_space, self._track_space = box(RIG_FEATURES.values()), box(CANDIDATE_FEATURES.values(), SLOTS)
         self.action_space = gymnasium.spaces.Discrete(SLOTS)  # type: ignore[assignment]  # its numbers are numpy's
         pictures = self._picture_spaces() if observation == "images" else {}
@@ -195,8 +194,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
             ConfigError: there is no such slot, or no episode.
         """
         self.episode  # noqa: B018  raises if there is none
-        if not self.action_space.contains(action):
-            raise ConfigError(f"action: {shortened(action)} is not the number of a slot, 0 to {SLOTS - 1}")
+        require(self.action_space.contains(action), "action", action, f"the number of a slot, 0 to {SLOTS - 1}")
         self._selector.number = self._slots[action]
         before = self._step.zoom.t
         self._index += 1
@@ -266,14 +264,13 @@ class Schedule(RigEnv[dict[str, Any], int]):
     def _info(self, good: dict[str, bool]) -> dict[str, Any]:
         """Collect the ground truth."""
         (t, t_closeup), episode, names = self.times, self.episode, list(good)
-        outlines = episode.outlines
         return {
             "t": t,
             "t_closeup": t_closeup,
             "good": np.array(list(good.values())),
             "good_s": np.array(list(self._good_s.values())),
-            "box_closeup": np.array([corners(outlines.box(name, "zoom", t_closeup)) for name in names]),
-            "box_wide": np.array([corners(outlines.box(name, "fixed", t)) for name in names]),
+            "box_closeup": np.array([episode.box(name, "zoom", t_closeup) for name in names]),
+            "box_wide": np.array([episode.box(name, "fixed", t) for name in names]),
             "direction": np.array([episode.direction(name, t) for name in names]),
             "served": self._served(),
             "action_mask": np.array([number is not None for number in self._slots], dtype=np.int8),

@@ -1,8 +1,6 @@
 """The gymnasium environments: their spaces and checks, seeds, what they take and show, and what they refuse."""
 
-import dataclasses
 import math
-import re
 
 import gymnasium
 import numpy as np
@@ -17,18 +15,13 @@ from cotarget.env.follow import TRACK_FEATURES
 from cotarget.env.schedule import SLOTS
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.evaluation import TruthNoise
-from tests.support.env_episodes import FRAME_S, field_rig, run
+from tests.support.env_episodes import FRAME_S, run
 
 NO_NOISE = TruthNoise(center_px=0.0, size=0.0, miss=0.0)
 STILL = np.zeros(3, np.float32)
 TRACK, RIG = list(TRACK_FEATURES), list(RIG_FEATURES)
 # Without noise the filter is as far off as limbs move a box's edges: a part of the picture; relative, of the median.
 PLACE, WIDTH, HEIGHT = 0.01, 0.5, 0.05
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory):
-    return field_rig(tmp_path_factory.mktemp("field"))
 
 
 def named(observation):
@@ -58,54 +51,50 @@ def test_both_are_registered():
 
 def flat(observation, *index):
     """All numbers of an observation, or of one of those of a vector of environments."""
-    return np.concatenate([np.ravel(each[index]).astype(float) for each in values(observation)])
-
-
-def assert_agrees_with_one(vector, alone, action=STILL):
-    """The first of two environments does in a vector what it does alone, and the second something else."""
-    observations, _ = vector.reset(seed=[7, 8])
-    np.testing.assert_array_equal(flat(observations, 0), flat(alone[0][0]))
-    for observation, reward, info in alone[1:]:
-        observations, rewards, _, _, infos = vector.step(np.stack([action, action]))
-        np.testing.assert_array_equal(flat(observations, 0), flat(observation))
-        assert rewards[0] == reward
-        np.testing.assert_array_equal(infos["box_wide"][0], info["box_wide"])
-    assert np.abs(flat(observations, 1) - flat(observations, 0)).max() > 0.01
-    vector.close()
+    parts = [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
+    return np.concatenate([np.ravel(each[index]).astype(float) for each in parts])
 
 
 def make_book():
     return gymnasium.make(f"cotarget.env:{FOLLOW}", target="book", seconds=1.0)  # a spawned process knows no more
 
 
-def test_a_vector_of_environments_agrees_with_one():
-    assert_agrees_with_one(SyncVectorEnv([make_book] * 2), run(make_book(), lambda _: STILL, seed=7, seconds=0.4))
+def in_vector(vector, seconds, action=STILL):
+    """What the first and the second of two environments tell: observations, rewards, and boxes in the fixed image."""
+    observations, infos = vector.reset(seed=[7, 8])
+    told = [(observations, np.zeros(2), infos)]
+    for _ in range(round(seconds / FRAME_S)):
+        observations, rewards, _, _, infos = vector.step(np.stack([action, action]))
+        told.append((observations, rewards, infos))
+    vector.close()
+    return [[(flat(o, i).tolist(), r[i], n["box_wide"][i].tolist()) for o, r, n in told] for i in (0, 1)]
 
 
-def test_a_vector_of_schedules_agrees_with_one(field):
-    def make():
-        return gymnasium.make(SCHEDULE, kind="bird", rig=field, seconds=4.0)
-
-    alone = run(make(), lambda _: 0, seed=7, seconds=2.0)
-    assert alone[-1][0]["tracks"].any()
-    assert_agrees_with_one(SyncVectorEnv([make] * 2), alone, np.int64(0))
-
-
-@pytest.mark.slow
-@pytest.mark.render
-def test_a_rig_and_pictures_in_processes_of_their_own(field):
-    chosen = {"target": "book", "observation": "images", "rig": field, "seconds": 1.0}
-    vector = gymnasium.make_vec(
-        FOLLOW, num_envs=2, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **chosen
-    )
-    assert_agrees_with_one(vector, run(gymnasium.make(FOLLOW, **chosen), lambda _: STILL, seed=7, seconds=0.4))
+@pytest.mark.parametrize("opened", [
+    SyncVectorEnv,
+    pytest.param(lambda makers: AsyncVectorEnv(makers, context="spawn"), marks=pytest.mark.slow),
+    pytest.param(lambda makers: AsyncVectorEnv(makers, context="forkserver"), marks=pytest.mark.slow),
+], ids=["sync", "spawn", "forkserver"])  # fmt: skip
+def test_an_environment_in_a_vector_does_what_it_does_alone(opened):
+    first, second = in_vector(opened([make_book] * 2), seconds=0.4)
+    assert first == [
+        (flat(o).tolist(), r, i["box_wide"].tolist()) for o, r, i in run(make_book(), lambda _: STILL, 7, 0.4)
+    ]
+    assert first[-1] != second[-1]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("context", ["spawn", "forkserver"])
-def test_environments_in_processes_of_their_own_agree_with_one(context):
-    alone = run(make_book(), lambda _: STILL, seed=7, seconds=0.4)
-    assert_agrees_with_one(AsyncVectorEnv([make_book] * 2, context=context), alone)
+@pytest.mark.parametrize(("name", "action", "chosen"), [
+    (SCHEDULE, np.int64(0), {"kind": "bird", "seconds": 4.0}),
+    pytest.param(FOLLOW, STILL, {"target": "book", "observation": "images", "seconds": 1.0},
+                 marks=[pytest.mark.slow, pytest.mark.render]),
+])  # fmt: skip
+def test_other_environments_and_rigs_do_so_too(field, name, action, chosen):
+    how, seconds = ("async", 0.4) if name == FOLLOW else ("sync", 2.0)
+    context = {"vector_kwargs": {"context": "spawn"}} if how == "async" else {}
+    vector = gymnasium.make_vec(name, num_envs=2, vectorization_mode=how, rig=field, **context, **chosen)
+    alone = run(gymnasium.make(name, rig=field, **chosen), lambda _: action, 7, seconds)
+    first, _ = in_vector(vector, seconds, action)
+    assert first == [(flat(o).tolist(), r, i["box_wide"].tolist()) for o, r, i in alone]
 
 
 def test_a_vector_begins_anew_where_an_episode_ends():
@@ -138,10 +127,6 @@ def test_the_same_seed_gives_the_same_episode_and_no_seed_another(field, make):
     repeated = told(seed=3), told()
     np.testing.assert_array_equal(repeated[1][2], other[2])  # what follows a seed is told by it, too
     env.close()
-
-
-def values(observation):
-    return [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
 
 
 # ---------------------------------------------------------------- actions and observations
@@ -212,99 +197,90 @@ def test_a_target_that_is_missed_is_still_known_for_a_while(field):
     env.close()
 
 
+class Shrunk:
+    """The truth of targets so many times as large."""
+
+    def __init__(self, outlines, factor):
+        self.outlines, self.factor = outlines, factor
+
+    def __getattr__(self, name):
+        return getattr(self.outlines, name)
+
+    def box(self, *asked):
+        low, high = self.outlines.box(*asked)
+        middle = (low + high) / 2
+        return middle + self.factor * (low - middle), middle + self.factor * (high - middle)
+
+
 @pytest.mark.parametrize(("make", "name", "action", "steps"), [
     (Follow, "book", STILL, 20), (Schedule, "bird", 0, 70),
 ])  # fmt: skip
 def test_the_truth_is_in_info_alone(field, make, name, action, steps):
     """The same detections of another true size: the same observations, and another truth."""
     told = []
-    for stretch in (1.0, 0.7):
+    for factor in (1.0, 0.7):
         env = make(name, rig=field, seconds=4.0)
         env.reset(seed=4)
-        detector, outlines = env.episode.detector, env.episode.outlines
-        frame = env.episode.rig.fixed.read()
-        found = {k: detector.detect(dataclasses.replace(frame, t=k * FRAME_S)) for k in range(steps + 10)}
-        detector.detect = lambda frame, found=found: found[round(frame.t / FRAME_S)]
-        outlines._points = {each: points * stretch for each, points in outlines._points.items()}
-        outlines._t = math.nan  # what it has worked out is of the other size
+        env.episode.outlines = Shrunk(env.episode.outlines, factor)
         told.append([env.step(action) for _ in range(steps)])
         env.close()
     for one, other in zip(*told, strict=True):
         np.testing.assert_array_equal(flat(one[0]), flat(other[0]))
         boxes = [each[4]["box_wide"].reshape(-1, 2, 2) for each in (one, other)]
         sizes = [box[:, 1] - box[:, 0] for box in boxes]
-        assert sizes[1] == pytest.approx(0.7 * sizes[0], rel=0.03)  # it is far away
-    known = one[0]["tracks"] if make is Schedule else one[0]
-    assert known.any()
+        assert sizes[1] == pytest.approx(0.7 * sizes[0])
+    assert (one[0]["tracks"] if make is Schedule else one[0]).any()
 
 
 # ---------------------------------------------------------------- what is refused
-@pytest.mark.parametrize(("make", "said"), [
-    (lambda: Follow("dragon"), "target: unknown 'dragon'; there are: bird, book, person"),
-    (lambda: Schedule("book"), "kind: unknown 'book'; there are: bird, person"),
-    (lambda: Follow(observation="smell"), "observation: unknown 'smell'; there are: images, tracks"),
-    (lambda: Follow(observation=np.zeros(3)), "observation: unknown array([0., 0., 0.]); there are: images, tracks"),
-    (lambda: Schedule(["bird"]), "kind: unknown ['bird']; there are: bird, person"),
-    (lambda: Follow(seconds=21), "seconds: 21 is not above 0 and up to 20"),
-    (lambda: Follow(seconds=math.nan), "seconds: nan is not"),
-    (lambda: Follow(image_size=(4, 64)), "image_size: (4, 64) is not (width, height) of 8 to 4096 pixels each"),
-    (lambda: Follow(image_size=(64, 100_000)), "image_size: (64, 100000) is not"),
-    (lambda: Follow(image_size=64), "image_size: 64 is not"),
-    (lambda: Follow(render_mode="human"), "render_mode: unknown 'human'; there is: rgb_array"),
-    (lambda: Follow(rig="nothing.toml"), "nothing.toml: no such file"),
-    (lambda: Follow(rig=RigConfig(backend="hardware")), "rig: its backend is 'hardware'; environments are on 'sim'"),
-    (lambda: Follow(seconds="5"), "seconds: '5' is not"),
-    (lambda: Follow(rig=3), "rig: 3 is neither a cotarget.config.RigConfig nor the path"),
-    (lambda: Follow(calibration=3), "calibration: 3 is neither a cotarget.calibration.Calibration nor the path"),
+@pytest.mark.parametrize(("make", "named"), [
+    (lambda: Follow("dragon"), "target: 'dragon'"),
+    (lambda: Schedule("book"), "kind: 'book'"),
+    (lambda: Schedule(["bird"]), "kind: ['bird']"),
+    (lambda: Follow(observation="smell"), "observation: 'smell'"),
+    (lambda: Follow(observation=np.zeros(3)), "observation: array([0., 0., 0.])"),
+    (lambda: Follow(render_mode="human"), "render_mode: 'human'"),
+    *((lambda given=given: Follow(seconds=given), f"seconds: {given!r}") for given in (21, 0.0, math.nan, "5")),
+    *((lambda given=given: Follow(image_size=given), f"image_size: {given!r}")
+      for given in ((4, 64), (64, 100_000), 64, (64,), (64.0, 64.0))),
+    (lambda: Follow(rig="nothing.toml"), "nothing.toml: "),
+    (lambda: Follow(rig=RigConfig(backend="hardware")), "rig: its backend is 'hardware'"),
+    (lambda: Follow(rig=3), "rig: 3"),
+    (lambda: Follow(calibration=3), "calibration: 3"),
     (lambda: Follow(calibration="nothing.json"), "nothing.json: "),
-    (lambda: Follow(noise=0.5), "noise: 0.5 is no cotarget.evaluation.TruthNoise"),
-    (lambda: Schedule(served_reward=math.inf), "served_reward: inf is not a finite number"),
-    (lambda: Schedule(served_reward="much"), "served_reward: 'much' is not a finite number"),
-    (lambda: PipelinePolicy(Schedule()), "the pipeline is a policy of cotarget/Follow-v0"),
-    (lambda: SchedulingPolicy(Follow()), "policies choose in cotarget/Schedule-v0"),
-    (lambda: SchedulingPolicy(Schedule(), ["best"]), "policy: unknown ['best']; there are: first-come, most-served"),
-    (lambda: SchedulingPolicy(Schedule(), "best"), "policy: unknown 'best'; there are: first-come, most-served"),
-    (lambda: Follow().reset(options={"wind": 3}), "options: reset knows no 'wind'"),
-    (lambda: Follow().reset(options=3), "options: reset knows no 3"),
-    (lambda: Follow().reset(options=np.zeros(3)), "options: reset knows no array([0., 0., 0.])"),
+    (lambda: Follow(noise=0.5), "noise: 0.5"),
+    (lambda: Schedule(served_reward=math.inf), "served_reward: inf"),
+    (lambda: Schedule(served_reward="much"), "served_reward: 'much'"),
+    (lambda: PipelinePolicy(Schedule()), "env: "),
+    (lambda: SchedulingPolicy(Follow()), "env: "),
+    (lambda: SchedulingPolicy(Schedule(), ["best"]), "policy: ['best']"),
+    (lambda: SchedulingPolicy(Schedule(), "best"), "policy: 'best'"),
+    *((lambda given=given: Follow().reset(options=given), f"options: {given!r}")
+      for given in ({"wind": 3}, 3, np.zeros(3))),
 ])  # fmt: skip
-def test_what_makes_no_sense_is_refused_in_a_line(make, said):
-    with pytest.raises(CotargetError, match=re.escape(said)) as caught:
+def test_what_makes_no_sense_is_refused_in_a_line(make, named):
+    with pytest.raises(CotargetError) as caught:
         make()
+    assert str(caught.value).startswith(named)
     assert "\n" not in str(caught.value)
 
 
-def test_an_argument_that_there_is_not_is_named():
-    with pytest.raises(TypeError, match="unexpected keyword argument 'wind'"):
-        gymnasium.make(FOLLOW, wind=3)
-
-
-def test_actions_that_are_none_are_refused(field):
-    env = Follow("book", rig=field, seconds=1.0)
-    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
-        env.step(STILL)
+@pytest.mark.parametrize(("make", "good", "wrong"), [
+    (lambda field: Follow("book", rig=field, seconds=1.0), STILL,
+     [[0.0, 0.0], [0.0, math.nan, 0.0], [[0.0, 0.0, 0.0]], np.zeros((40, 40)), "left", None, [[1], [2, 3]]]),
+    (lambda field: Schedule("bird", rig=field, seconds=1.0), 0,
+     [SLOTS, -1, 0.5, math.nan, np.zeros((40, 40)), "first", None]),
+], ids=["follow", "schedule"])  # fmt: skip
+def test_actions_that_are_none_are_refused(field, make, good, wrong):
+    env = make(field)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(good)
     env.reset(seed=0)
-    for action in (
-        [0.0, 0.0],
-        [0.0, math.nan, 0.0],
-        [[0.0, 0.0, 0.0]],
-        np.zeros((40, 40)),
-        "left",
-        None,
-        [[1], [2, 3]],
-    ):
-        with pytest.raises(ConfigError, match="is not three finite numbers") as caught:
+    for action in wrong:
+        with pytest.raises(ConfigError) as caught:
             env.step(action)
+        assert str(caught.value).startswith("action: ")
         assert "\n" not in str(caught.value)
     env.close()
     with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(STILL)
-    several = Schedule("bird", rig=field, seconds=1.0)
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        several.step(0)
-    several.reset(seed=0)
-    for action in (SLOTS, -1, 0.5, math.nan, np.zeros((40, 40)), "first", None):
-        with pytest.raises(ConfigError, match="is not the number of a slot, 0 to 7") as caught:
-            several.step(action)
-        assert "\n" not in str(caught.value)
-    several.close()
+        env.step(good)

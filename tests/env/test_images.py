@@ -14,15 +14,10 @@ from cotarget.env import FOLLOW, Follow, Schedule
 from cotarget.env.common import DEFAULT_RIG
 from cotarget.errors import DeviceError
 from cotarget.sim.render import opengl
-from tests.support.env_episodes import field_rig, run, uncollected
+from tests.support.env_episodes import run, uncollected
 
 pytestmark = pytest.mark.render
 STILL = np.zeros(3, np.float32)
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory):
-    return field_rig(tmp_path_factory.mktemp("field"))
 
 
 @pytest.mark.parametrize("make", [Follow, pytest.param(Schedule, marks=pytest.mark.slow)])
@@ -98,11 +93,13 @@ def test_effects_of_the_rig_show_in_the_pictures():
 
 
 def test_close_leaves_nothing_behind(monkeypatch, field):
-    opened, open_one = [], opengl.make_renderer
+    opened, closed, open_one = [], [], opengl.make_renderer
 
     def noting(*args):
-        opened.append(open_one(*args))
-        return opened[-1]
+        opened.append(renderer := open_one(*args))
+        end = renderer.close
+        renderer.close = lambda: (closed.append(renderer), end())
+        return renderer
 
     monkeypatch.setattr(opengl, "make_renderer", noting)
     threads = threading.active_count()
@@ -115,11 +112,10 @@ def test_close_leaves_nothing_behind(monkeypatch, field):
         last = weakref.ref(env.episode.world)
         env.reset(seed=2)  # though nobody renders now
         assert last() is None
-    assert len(opened) == 2  # one a size, and the second episode opened none
+    assert (len(opened), closed) == (2, [])  # one a size, and the second episode opened none
     assert threading.active_count() == threads
-    assert all(renderer._gl_context is not None for renderer in opened)
     env.close()
-    assert all(renderer._gl_context is None and renderer._mjr_context is None for renderer in opened)
+    assert all(renderer in closed for renderer in opened)
     env.close()
 
 

@@ -13,13 +13,8 @@ from cotarget.env.schedule import CANDIDATE_FEATURES, SLOTS
 from cotarget.evaluation import closeup_of, true_calibration
 from cotarget.geometry import pose
 from cotarget.metrics import SERVED_S
-from tests.support.env_episodes import FRAME_S, field_rig, run
+from tests.support.env_episodes import FRAME_S, run
 from tests.support.rigs import with_zoom_head
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory):
-    return field_rig(tmp_path_factory.mktemp("field"))
 
 
 # ---------------------------------------------------------------- rewards
@@ -126,7 +121,8 @@ def test_a_track_keeps_its_slot_and_the_slot_chosen_is_followed(field):
         tracks = {name: observation["tracks"][:, i] for i, name in enumerate(CANDIDATE_FEATURES)}
         np.testing.assert_array_equal(tracks["there"], info["action_mask"])
         assert not observation["tracks"][info["action_mask"] == 0].any()
-        slots.append([c.id if c else 0 for c in (by_slot(env, slot) for slot in range(SLOTS))])
+        slot_of = {env.slot_of(each.id): each.id for each in env.candidates}
+        slots.append([slot_of.get(slot, 0) for slot in range(SLOTS)])
         there = was_there and bool(tracks["there"][wish])
         followed.append((wish, np.flatnonzero(tracks["followed"]).tolist(), there))
     for number in {number for row in slots for number in row if number}:
@@ -135,10 +131,6 @@ def test_a_track_keeps_its_slot_and_the_slot_chosen_is_followed(field):
     assert all(seen == [wish] for wish, seen, there in followed if there)
     assert all(seen == [] for _, seen, _ in followed[102:])
     env.close()
-
-
-def by_slot(env, slot):
-    return next((each for each in env.candidates if env.slot_of(each.id) == slot and each.id in env._slots), None)
 
 
 # ---------------------------------------------------------------- who does well

@@ -16,15 +16,10 @@ from cotarget.config import RigConfig, SafetyConfig
 from cotarget.env import FOLLOW, Follow, PipelinePolicy, Schedule
 from cotarget.env.common import DEFAULT_RIG
 from cotarget.errors import ConfigError
-from tests.support.env_episodes import FIELD, field_rig, run, uncollected
+from tests.support.env_episodes import FIELD, run, uncollected
 
 STILL = np.zeros(3, np.float32)
 ROUNDING = 1e-9  # of an angle [rad]
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory):
-    return field_rig(tmp_path_factory.mktemp("field"))
 
 
 def simulated(config=DEFAULT_RIG, **changes):
