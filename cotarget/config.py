@@ -9,7 +9,6 @@ values that make no sense.
 """
 
 import dataclasses
-import json
 import re
 import tomllib
 import types
@@ -341,26 +340,6 @@ def known_targets(own: Iterable[str] = ()) -> str:
     return (
         f"the simulation has: {choices([*KINDS, *own])}, and further ones with a number, as 'bird2'; others need a "
         "model: [sim.models]"
-    )
-
-
-def check_shown(config: "RigConfig", name: str) -> None:
-    """Refuse to follow a target that the simulated scene does not contain.
-
-    Args:
-        config: configuration of the rig.
-        name: name of the target, one of the configuration's.
-
-    Raises:
-        ConfigError: the scene lacks the target; the message says how to add it.
-    """
-    if config.backend != "sim" or name in config.sim.targets:
-        return
-    own = config.sim.models
-    if split_name(name)[0] not in (*KINDS, *own):
-        raise ConfigError(f"a simulated {name} cannot be, whatever [targets.{name}] says; {known_targets(own)}")
-    raise ConfigError(
-        f"the simulated scene has no {name}; add it: [sim] targets = {json.dumps([*config.sim.targets, name])}"
     )
 
 

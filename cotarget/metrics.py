@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -93,13 +94,7 @@ class Row:
         t_fixed_s: middle of the fixed frame's exposure [s].
         state: state of the pipeline.
         track: id of the followed track; -1 for none.
-        u_px: true position of the target's body centre in the zoom image [px]; nan behind the camera.
-        v_px: its v coordinate [px].
-        width_px: width of the zoom image [px].
-        height_px: height of the zoom image [px].
-        size_px: true size of the wanted dimension in the zoom image [px]; nan behind the camera.
-        wanted_px: wanted size, or the size at the longest focal length if that is less [px].
-        visible: part of the true silhouette visible in the zoom image, 0 to 1.
+        u_px, v_px, width_px, height_px, size_px, wanted_px, visible: the zoom frame's `Closeup`.
         in_wide: whether the target is wholly in the fixed image.
         u_wide_px: true position in the fixed image [px].
         v_wide_px: its v coordinate [px].
@@ -211,28 +206,46 @@ def read_rows(path: Path) -> list[Row]:
     Raises:
         ConfigError: the file is missing, or is no steps.csv.
     """
-    kinds = {f.name: f.type for f in dataclasses.fields(Row)}
-    parse: dict[object, Callable[[str], object]] = {int: int, float: float, str: str, bool: _truth_value}
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            if missing := [name for name in kinds if name not in (reader.fieldnames or ())]:
-                raise ValueError(f"it has no column '{missing[0]}'")
-            lines = list(reader)
-        if any(None in line.values() for line in lines):
-            raise ValueError("a line of it was cut off")
-        return [
-            Row(**{name: parse[kind](line[name]) for name, kind in kinds.items()})  # type: ignore[arg-type]
-            for line in lines
-        ]
-    except (OSError, csv.Error, ValueError) as error:
-        raise ConfigError(f"{path}: is not a steps.csv: {error}") from None
+    parse: dict[Any, Callable[[str], Any]] = {int: int, float: float, str: str, bool: _truth_value}
+    columns = {f.name: parse[f.type] for f in dataclasses.fields(Row)}
+    return [Row(**row) for row in _read_table(path, columns, "steps.csv")]
 
 
 def _truth_value(text: str) -> bool:
-    if text not in ("True", "False"):
-        raise ValueError(f"'{text}' is not True or False")
-    return text == "True"
+    return {"True": True, "False": False}[text]
+
+
+def _read_table(path: Path, columns: Mapping[str, Callable[[str], Any]], what: str) -> list[dict[str, Any]]:
+    """Read columns of a csv.
+
+    Args:
+        path: the file.
+        columns: what reads a column's texts, by the column's name.
+        what: what the file is to be, for messages.
+
+    Raises:
+        ConfigError: the file is missing, lacks a column, or holds something else.
+    """
+    rows = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark
+            reader = csv.DictReader(file)
+            if missing := [name for name in columns if name not in (reader.fieldnames or ())]:
+                raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(columns)}")
+            for line, row in enumerate(reader, start=2):
+                if None in row.values():
+                    raise ValueError(f"line {line} is cut off")
+                for name, read in columns.items():
+                    try:
+                        row[name] = read(row[name])
+                    except (KeyError, TypeError, ValueError):
+                        raise ValueError(f"line {line} has {row[name]!r} for {name}") from None
+                rows.append({name: row[name] for name in columns})
+        return rows
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}; give a csv with {', '.join(columns)}") from None
+    except (csv.Error, ValueError) as error:
+        raise ConfigError(f"{path}: is no {what}: {error}") from None
 
 
 # Tracks on a film, scored by labels
@@ -375,7 +388,7 @@ def read_labels(path: Path) -> dict[int, list[Label]]:
         ConfigError: the file is missing, is no such table, or has no row.
     """
     labels: dict[int, list[Label]] = {}
-    for row in _table(path, LABELS, "labels"):
+    for row in _read_table(path, dict.fromkeys(LABELS, _finite), "table of labels"):
         frame, x, y, width, height = (row[name] for name in LABELS)
         if not (width > 0 and height > 0 and frame >= 0 and frame == int(frame)):
             raise ConfigError(f"{path}: a label wants a whole frame from 0 and a width and height above 0, not {row}")
@@ -393,36 +406,21 @@ def read_tracks(path: Path) -> list[Tracked]:
     Raises:
         ConfigError: the file is missing, or is no such table.
     """
-    names = ("frame", "t", "track", "u_px", "v_px")
+    columns = dict.fromkeys(("frame", "t", "track", "u_px", "v_px"), _finite)
     return [
         Tracked(int(row["frame"]), row["t"], int(row["track"]), np.array([row["u_px"], row["v_px"]]))
-        for row in _table(path, names, "tracks")
+        for row in _read_table(path, columns, "table of tracks")
     ]
 
 
-def _table(path: Path, names: Sequence[str], what: str) -> list[dict[str, float]]:
-    """Read columns of numbers from a csv.
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
 
-    Raises:
-        ConfigError: the file is missing, lacks a column, or holds something else.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark
-            reader = csv.DictReader(file)
-            if missing := [name for name in names if name not in (reader.fieldnames or ())]:
-                raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(names)}")
-            rows = [{name: float(row[name] or "nan") for name in names} for row in reader]
-        for line, row in enumerate(rows, start=2):
-            if odd := [name for name, value in row.items() if not math.isfinite(value)]:
-                raise ValueError(f"line {line} has no number for {odd[0]}")
-        return rows
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; give a csv with {','.join(names)}") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except (csv.Error, ValueError, TypeError) as error:
-        raise ConfigError(f"{path}: is no table of {what}: {error}") from None
 
+# Scores of a run
 
 # Time in frame without a break after which a target is acquired [s].
 ACQUIRED_S = 0.5

@@ -16,7 +16,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.plausibility import check_plausible
-from cotarget.config import TargetProfile, check_shown
+from cotarget.config import TargetProfile
 from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome, TargetSelector
@@ -37,6 +37,7 @@ from cotarget.rig import (
     PanTiltState,
     Rig,
     ZoomState,
+    check_shown,
     opened_from,
 )
 from cotarget.targeting import Aim, target_implausibility
@@ -354,7 +355,7 @@ def _profile(rig: Rig, target: TargetProfile | str) -> tuple[str, TargetProfile]
             f"follow: target is {target!r}; give a TargetProfile or one name, of: {choices(config.targets)}"
         )
     profile = config.target(target)
-    check_shown(config, target)
+    check_shown(rig.spec, target)
     return target, profile
 
 

@@ -4,6 +4,7 @@ A rig is the MuJoCo simulation, real devices, or a recording; the pipeline canno
 advances the rig's own clock, which is simulated time in the simulation.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
@@ -147,12 +148,25 @@ class RigSpec:
         zoom: the zoom camera.
         head: the head.
         real_time: whether time passes without calls; a simulation's passes only inside them.
+        targets: names of the targets in a simulated scene; None where others may come into view.
     """
 
     fixed: CameraSpec
     zoom: ZoomSpec
     head: HeadSpec
     real_time: bool = False
+    targets: tuple[str, ...] | None = None
+
+
+def check_shown(spec: RigSpec, target: str) -> None:
+    """Refuse to follow a target that the simulated scene does not contain.
+
+    Raises:
+        ConfigError: the scene lacks the target; the message says how to add it.
+    """
+    if spec.targets is not None and target not in spec.targets:
+        names = json.dumps([*spec.targets, target])
+        raise ConfigError(f"the simulated scene has no {target}; add it: [sim] targets = {names}")
 
 
 class Camera(Protocol):

@@ -128,11 +128,12 @@ def step_of(world, **changes):
     return dataclasses.replace(step, **changes)
 
 
-def track(number, center_px, t=0.0, box_px=None, confirmed=True, missed=0):
+def track(number, center_px, t=0.0, box_px=None, confirmed=True, missed=0, shared=False):
     """A track whose filtered middle need not be where its last detection is."""
     center, size = np.array(center_px, dtype=float), np.array([16.0, 12.0])
     box = Detection(center if box_px is None else np.array(box_px, dtype=float), size, 1.0)
-    return Track(number, t, confirmed, missed, center, np.zeros(2), size, 16.0, np.eye(4), 1.0, box)
+    found = Track(number, t, confirmed, missed, center, np.zeros(2), size, 16.0, np.eye(4), 1.0, box)
+    return dataclasses.replace(found, shared=shared)
 
 
 def row_of(world, **changes):
@@ -141,7 +142,8 @@ def row_of(world, **changes):
 
 def test_a_row_says_what_is_so(book):
     """The book, 0.234 m at 10 m and 0.4 m to the left of the zoom camera: u = 326 - 692 * 0.4 / 10, v = 235."""
-    row = row_of(book)
+    row = row_of(book, head_commands=3, lens_commands=2)
+    assert (row.head_commands, row.lens_commands) == (3, 2)
     assert (row.u_px, row.v_px) == pytest.approx((326 - 692 * 0.04, 235), abs=1e-6)
     assert (row.u_wide_px, row.v_wide_px) == pytest.approx((325, 239), abs=1e-6)
     assert row.range_m == pytest.approx(math.hypot(10, 0.4))
@@ -157,41 +159,29 @@ def test_a_row_says_what_is_so(book):
     assert row.off_target == ""
 
 
-def test_a_row_says_how_many_commands_were_sent(book):
-    row = row_of(book, head_commands=3, lens_commands=2)
-    assert (row.head_commands, row.lens_commands) == (3, 2)
-
-
 def test_the_detection_is_judged_and_only_where_there_is_one(book):
     """The filter's middle and its prediction are not the detection; a coasting track has none."""
     seen = row_of(book, target=track(4, (300, 200), box_px=(325 + 3, 239 - 4)))
     assert seen.track == 4
     assert seen.tpe_px == pytest.approx(5.0, abs=1e-6)
-    shared = dataclasses.replace(track(4, (325, 239), box_px=(340, 239)), shared=True)
+    shared = track(4, (325, 239), box_px=(340, 239), shared=True)
     for nothing in (track(4, (325, 239), missed=1), shared):  # the box of two is the detection of neither
         row = row_of(book, target=nothing)
         assert row.track == 4
         assert math.isnan(row.tpe_px)
 
 
-def test_a_track_is_off_target_when_it_is_farther_than_the_larger_side(book):
-    """The larger side is the book's width, 16 to 17 px, about (325, 239)."""
-    tracks = (
-        track(2, (325 + 15, 239)),
-        track(3, (325 + 18, 239)),
-        track(5, (325, 239 - 15)),
-        track(6, (100, 100), confirmed=False),
-        track(7, (325, 239 + 18)),
-    )
-    assert row_of(book, tracks=tracks).off_target == "3 7"
-    assert row_of(book, tracks=tracks).on_target == "2:book 5:book"
-
-
-def test_a_track_is_on_a_target_only_while_it_is_seen_alone(book):
-    at = (325, 239)
-    tracks = (track(2, at, missed=1), dataclasses.replace(track(3, at), shared=True), track(4, at, confirmed=False))
-    row = row_of(book, tracks=(*tracks, track(5, at)))
-    assert (row.on_target, row.off_target) == ("5:book", "")
+@pytest.mark.parametrize(("tracks", "on", "off"), [
+    # The larger side is the book's width, 16 to 17 px, about (325, 239).
+    ([track(2, (325 + 15, 239)), track(3, (325 + 18, 239)), track(5, (325, 239 - 15)), track(7, (325, 239 + 18)),
+      track(6, (100, 100), confirmed=False)], "2:book 5:book", "3 7"),
+    # A track is on a target only while it is seen, alone.
+    ([track(2, (325, 239), missed=1), track(3, (325, 239), shared=True), track(4, (325, 239), confirmed=False),
+      track(5, (325, 239))], "5:book", ""),
+])  # fmt: skip
+def test_tracks_are_on_target_or_off_it(book, tracks, on, off):
+    row = row_of(book, tracks=tuple(tracks))
+    assert (row.on_target, row.off_target) == (on, off)
 
 
 def test_a_zoom_frame_has_one_row(book):

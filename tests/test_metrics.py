@@ -312,7 +312,7 @@ def table(edit):
 def test_what_is_no_table_is_refused_in_one_line(tmp_path, content):
     path = tmp_path / "steps.csv"
     path.write_bytes(content)
-    with pytest.raises(ConfigError, match=r"steps\.csv: is not a steps\.csv") as caught:
+    with pytest.raises(ConfigError, match=r"steps\.csv: is no steps\.csv") as caught:
         read_rows(path)
     assert "\n" not in str(caught.value)
 

@@ -12,7 +12,7 @@ from cotarget.backends import load_config
 from cotarget.sim.world import SimWorld
 from experiments.engine.cases import choose, known_experiments
 from experiments.engine.command import main
-from tests.sim.test_own_models import BOX
+from tests.support.target_models import BOX
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = "rounding"  # the experiment that docs/experiments.md adds

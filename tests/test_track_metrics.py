@@ -111,29 +111,28 @@ def test_labels_of_a_spreadsheet_begin_with_a_mark(tmp_path):
     assert list(read_labels(path)) == [3]
 
 
-@pytest.mark.parametrize(
-    ("rows", "head", "why"),
-    [
-        (["1,2,3,4"], "frame,x_px,y_px,width_px", "no column 'height_px'"),
-        (["1,2,3,4"], "frame,x_px,y_px,width_px,height_px", "line 2 has no number for height_px"),
-        (["1,2,3,4,5", "2,nan,3,4,5"], "frame,x_px,y_px,width_px,height_px", "line 3 has no number for x_px"),
-        (["1,2,3,x,5"], "frame,x_px,y_px,width_px,height_px", "could not convert"),
-        (["1,2,3,0,5"], "frame,x_px,y_px,width_px,height_px", "above 0"),
-        (["1.5,2,3,4,5"], "frame,x_px,y_px,width_px,height_px", "whole frame"),
-        (["-1,2,3,4,5"], "frame,x_px,y_px,width_px,height_px", "whole frame from 0"),
-        ([], "frame,x_px,y_px,width_px,height_px", r"labels\.csv: holds no label"),
-    ],
-)
-def test_other_tables_are_refused_by_name(tmp_path, rows, head, why):
-    with pytest.raises(ConfigError, match=why):
+HEAD = "frame,x_px,y_px,width_px,height_px"
+
+
+@pytest.mark.parametrize(("rows", "head", "named"), [
+    (["1,2,3,4"], "frame,x_px,y_px,width_px", "'height_px'"),
+    (["1,2,3,4"], HEAD, "line 2"),
+    (["1,2,3,4,5", "2,nan,3,4,5"], HEAD, "line 3 has 'nan' for x_px"),
+    (["1,2,3,x,5"], HEAD, "line 2 has 'x' for width_px"),
+    (["1,2,3,0,5"], HEAD, "a label"),
+    (["1.5,2,3,4,5"], HEAD, "a label"),
+    (["-1,2,3,4,5"], HEAD, "a label"),
+    ([], HEAD, "no label"),
+])  # fmt: skip
+def test_other_tables_are_refused_by_name(tmp_path, rows, head, named):
+    with pytest.raises(ConfigError, match=rf"labels\.csv: .*{named}"):
         read_labels(write_labels(tmp_path / "labels.csv", rows, head))
 
 
 def test_files_that_cannot_be_read_are_told_as_such(tmp_path):
-    with pytest.raises(ConfigError, match=r"nothing\.csv: no such file; give a csv with frame,x_px,y_px,width_px"):
-        read_labels(tmp_path / "nothing.csv")
-    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
-        read_labels(tmp_path)
+    for path in (tmp_path / "nothing.csv", tmp_path):
+        with pytest.raises(ConfigError, match=rf"{path}: cannot be read"):
+            read_labels(path)
 
 
 def test_the_command_scores_a_film(tmp_path, capsys):

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 def follow_command(options: argparse.Namespace) -> int:
     """Run `cotarget follow`: follow a target with the rig, and record it on request; return the exit status."""
     from cotarget.backends import describe, load_config
-    from cotarget.config import check_shown
     from cotarget.recording.recorder import Recorder
+    from cotarget.rig import check_shown
     from cotarget.safety.safe_rig import guard
     from cotarget.safety.stop_file import refuse_if_stopped
     from cotarget.targeting import target_implausibility
@@ -57,7 +57,7 @@ def follow_command(options: argparse.Namespace) -> int:
     spec = describe(config)
     calibration = load_plausible(options.calibration, spec, insist=options.insist)
     with naming(options.rig):
-        check_shown(config, options.target)
+        check_shown(spec, options.target)
     check_outputs(_files(options), [*rig_files(options.rig, config), options.calibration], options.record)
     if not options.insist and (text := target_implausibility(target, calibration, spec, options.target)):
         raise ConfigError(f"{options.rig}: {text}; --insist follows it all the same")

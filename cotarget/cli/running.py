@@ -72,9 +72,10 @@ def watch(sights: "Iterator[Snapshot]", window: Any, now: Callable[[], float], s
 
 def _config(options: argparse.Namespace) -> "RigConfig":
     """Load or make the configuration of the rig to view."""
-    from cotarget.backends import load_config
-    from cotarget.config import RigConfig, check_shown
+    from cotarget.backends import describe, load_config
+    from cotarget.config import RigConfig
     from cotarget.demo import SCENES, sim_config
+    from cotarget.rig import check_shown
 
     if options.rig is None:
         if options.target is not None:
@@ -89,7 +90,7 @@ def _config(options: argparse.Namespace) -> "RigConfig":
         with naming("--target"):
             config.target(options.target)
         with naming(options.rig):
-            check_shown(config, options.target)
+            check_shown(describe(config), options.target)
     return config
 
 

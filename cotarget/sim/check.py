@@ -25,9 +25,7 @@ def check_sim(sim: SimConfig) -> None:
         ConfigError: a value is refused; the message names the key.
     """
     for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
-        _check_center(f"sim.{name}", camera)
-        _check_frame_time(f"sim.{name}", camera)
-        _check_lens(f"sim.{name}", camera)
+        _check_camera(f"sim.{name}", camera)
     if sim.effects.optics:
         _check_optics(sim.zoom)
     for name, waypoints in sim.paths.items():
@@ -35,11 +33,6 @@ def check_sim(sim: SimConfig) -> None:
             raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")
     _check_models(sim)
     _check_targets(sim)
-    for name in sim.targets:
-        if split_name(name)[0] in sim.models and name not in sim.paths:
-            raise ConfigError(
-                f"sim.targets: a {name} of your own needs a path: [sim.paths] {name} = [[t, x, y, z], ...]"
-            )
 
 
 def _check_models(sim: SimConfig) -> None:
@@ -54,32 +47,37 @@ def _check_models(sim: SimConfig) -> None:
 
 
 def _check_targets(sim: SimConfig) -> None:
-    """Refuse targets without a model, and two targets of one name."""
+    """Refuse targets without a model or a path, and two targets of one name."""
     for where, names in (("sim.targets", sim.targets), ("sim.paths", tuple(sim.paths))):
         for at, name in enumerate(names):
-            if split_name(name)[0] not in (*KINDS, *sim.models):
+            kind, _ = split_name(name)
+            if kind not in (*KINDS, *sim.models):
                 raise ConfigError(f"{where}: unknown target '{name}'; {known_targets(sim.models)}")
             if name in names[:at]:
-                kind = split_name(name)[0]
                 free = next(f"{kind}{number}" for number in itertools.count(2) if f"{kind}{number}" not in names)
                 raise ConfigError(f"{where}: '{name}' is named twice; a further one has a number, as '{free}'")
+            if kind in sim.models and name not in sim.paths:
+                raise ConfigError(
+                    f"{where}: a {name} of your own needs a path: [sim.paths] {name} = [[t, x, y, z], ...]"
+                )
 
 
-def _check_frame_time(where: str, camera: SimCamera) -> None:
-    """Refuse an exposure that is longer than a frame's interval."""
+def _check_camera(where: str, camera: SimCamera) -> None:
+    """Refuse a principal point outside the image, a too long exposure, and a distortion that leaves no rays."""
+    (u, v), (width, height) = camera.center_px, camera.size
+    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+        raise ConfigError(
+            f"{where}.center_px: ({u:g}, {v:g}) is not in the {width}x{height} image; give one near its middle, or none"
+        )
     if camera.exposure_s * camera.rate_hz > 1:
         raise ConfigError(
             f"{where}.exposure_s: {camera.exposure_s:g} s is longer than the {1 / camera.rate_hz:g} s from one frame "
             f"to the next, of which {camera.rate_hz:g} come a second"
         )
-
-
-def _check_center(where: str, camera: SimCamera) -> None:
-    """Refuse a principal point outside the image, such as one meant for a larger image."""
-    (u, v), (width, height) = camera.center_px, camera.size
-    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+    if _sees_nothing(Intrinsics(camera.size, camera.focal_px, camera.center_px, camera.distortion)):
         raise ConfigError(
-            f"{where}.center_px: ({u:g}, {v:g}) is not in the {width}x{height} image; give one near its middle, or none"
+            f"{where}.distortion: {list(camera.distortion)} folds back inside the image, so that parts of it see "
+            "nothing; give a weaker distortion, a longer focal_px or a smaller size"
         )
 
 
@@ -88,15 +86,6 @@ def _sees_nothing(lens: Intrinsics) -> bool:
     w, h = lens.size
     rim = np.array([(u, v) for u in np.linspace(-1, w, 9) for v in np.linspace(-1, h, 9)])
     return not np.isfinite(lens.ray(rim)).all()
-
-
-def _check_lens(where: str, camera: SimCamera) -> None:
-    """Refuse a distortion that leaves a part of the image without rays."""
-    if _sees_nothing(Intrinsics(camera.size, camera.focal_px, camera.center_px, camera.distortion)):
-        raise ConfigError(
-            f"{where}.distortion: {list(camera.distortion)} folds back inside the image, so that parts of it see "
-            "nothing; give a weaker distortion, a longer focal_px or a smaller size"
-        )
 
 
 def _check_optics(zoom: SimZoomCamera) -> None:

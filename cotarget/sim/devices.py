@@ -25,6 +25,7 @@ from cotarget.rig import (
     ZoomState,
     to_step,
 )
+from cotarget.safety.safe_rig import clipped
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
 # Frame times are multiples of the frame period. This part of a period [1] absorbs their rounding.
@@ -178,23 +179,18 @@ def head_drive(head: SimHead, effects: SimEffects) -> HeadDrive:
     return HeadDrive(Axis(speed, acceleration, play), Axis(speed, acceleration, play))
 
 
-def head_spec(head: SimHead, effects: SimEffects) -> HeadSpec:
-    """Describe the configured pan-tilt unit."""
-    drive = head_drive(head, effects)
+def rig_spec(config: RigConfig) -> RigSpec:
+    """Describe the configured simulated rig."""
+    fixed, zoom, head, effects = config.sim.fixed, config.sim.zoom, config.sim.head, config.sim.effects
+    axes, lens = head_drive(head, effects), lens_drive(zoom, effects)
     limits = PanTiltLimits(
         pan=(math.radians(head.pan_deg[0]), math.radians(head.pan_deg[1])),
         tilt=(math.radians(head.tilt_deg[0]), math.radians(head.tilt_deg[1])),
-        speed=drive.pan.speed,
-        acceleration=drive.pan.acceleration,
+        speed=axes.pan.speed,
+        acceleration=axes.pan.acceleration,
         step=math.radians(head.step_deg) if effects.steps else 0.0,
     )
-    return HeadSpec(limits, head.command_delay_s if effects.command_delay else 0.0)
-
-
-def rig_spec(config: RigConfig) -> RigSpec:
-    """Describe the configured simulated rig."""
-    fixed, zoom, effects = config.sim.fixed, config.sim.zoom, config.sim.effects
-    head, drive = head_spec(config.sim.head, effects), lens_drive(zoom, effects)
+    delay_s = head.command_delay_s if effects.command_delay else 0.0
     latency_s = (fixed.latency_s, zoom.latency_s) if effects.latency else (0.0, 0.0)
     return RigSpec(
         fixed=CameraSpec(fixed.size, fixed.rate_hz, latency_s[0]),
@@ -202,33 +198,28 @@ def rig_spec(config: RigConfig) -> RigSpec:
             size=zoom.size,
             rate_hz=zoom.rate_hz,
             latency_s=latency_s[1],
-            focal_range=(drive.shortest_px, drive.longest_px),
+            focal_range=(lens.shortest_px, lens.longest_px),
             pitch_mm=zoom.pitch_mm,
             still_size=zoom.size,
-            delay_s=head.delay_s,  # the lens starts after the head's command delay
+            delay_s=delay_s,  # the lens starts after the head's command delay
         ),
-        head=head,
+        head=HeadSpec(limits, delay_s),
+        targets=config.sim.targets,
     )
 
 
 class SimPanTilt:
     """Pan-tilt unit with command delay, trapezoidal profiles, steps, limits and backlash."""
 
-    def __init__(self, head: SimHead, effects: SimEffects, clock: Clock, drive: HeadDrive) -> None:
+    def __init__(self, spec: HeadSpec, clock: Clock, drive: HeadDrive) -> None:
         self._clock, self._drive = clock, drive
-        spec = head_spec(head, effects)
-        self._delay, self._limits = spec.delay_s, spec.limits
+        self.limits, self._delay = spec.limits, spec.delay_s
         self._rests = 0.0
-
-    @property
-    def limits(self) -> PanTiltLimits:
-        """Limits of angle, speed and acceleration, and the step size."""
-        return self._limits
 
     def state(self) -> PanTiltState:
         """Give the angles that the unit's step counters show now; backlash is not visible in them."""
         now = self._clock.now()
-        pan, tilt = (to_step(axis.motor(now)[0], self._limits.step) for axis in (self._drive.pan, self._drive.tilt))
+        pan, tilt = (to_step(axis.motor(now)[0], self.limits.step) for axis in (self._drive.pan, self._drive.tilt))
         return PanTiltState(pan, tilt, now < self._rests, now)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
@@ -239,8 +230,8 @@ class SimPanTilt:
         """
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
-        speeds = self._limits.capped(speed)
-        pan, tilt = self._clip(pan, self._limits.pan), self._clip(tilt, self._limits.tilt)
+        speeds = self.limits.capped(speed)
+        pan, tilt = (to_step(angle, self.limits.step) for angle in clipped(pan, tilt, self.limits))
         t = self._clock.now() + self._delay
         self._rests = max(self._drive.pan.command(t, pan, speeds[0]), self._drive.tilt.command(t, tilt, speeds[1]))
         if wait:
@@ -251,13 +242,6 @@ class SimPanTilt:
         """Brake both axes after the command delay."""
         t = self._clock.now() + self._delay
         self._rests = max(self._drive.pan.halt(t), self._drive.tilt.halt(t))
-
-    def _clip(self, angle: float, limits: tuple[float, float]) -> float:
-        step = self._limits.step
-        if not step:
-            return min(max(angle, limits[0]), limits[1])
-        lowest, highest = math.ceil(limits[0] / step - ROUNDING), math.floor(limits[1] / step + ROUNDING)
-        return min(max(round(angle / step), lowest), highest) * step
 
 
 class SimBoard:

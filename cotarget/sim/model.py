@@ -11,8 +11,8 @@ from cotarget.errors import ConfigError, choices
 from cotarget.files import assets_dir
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.sim.render.opengl import mujoco
-from cotarget.sim.targets.own_models import own_model
-from cotarget.sim.targets.target import Target, change_marker, scale_spec
+from cotarget.sim.targets.models import target_model
+from cotarget.sim.targets.target import Target
 from cotarget.sim.weather import INDOORS, add_clutter
 
 # The only conversion from MuJoCo's camera axes (x right, y up, z back) to OpenCV's (x right, y down, z forward).
@@ -20,7 +20,7 @@ T_OPENCV_MUJOCO = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0.0,
 MOUNT_SITE = "fixed_mount"
 RIG = "rig/"  # prefix of the rig's parts; the prefix of a target's parts is its name and a slash
 BOARD = RIG + "board"
-# Groups of geoms by purpose; MuJoCo draws the groups that the view's options enable.
+# Groups of geoms by purpose; those of scene and targets are below. MuJoCo draws what a view's options enable.
 BOARD_GROUP, RIG_GROUP, FRAME_GROUP = 3, 4, 5
 BOARD_THICKNESS = 0.004  # [m]
 BOARD_MARGIN = 0.6  # white border around the squares, in squares
@@ -85,7 +85,7 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
     _edit_rig(rig, config.sim, _site_pose(path.absolute(), path.stat().st_mtime_ns), render_size)
     _attach(spec, rig, RIG)
     for target in targets:
-        _attach(spec, _target_spec(target), f"{target.name}/")
+        _attach(spec, target_model(target, BOARD_GROUP), f"{target.name}/")
     _add_board(spec, config.board)
     if has_clutter(config.sim):
         add_clutter(spec, config.sim.seed)
@@ -96,21 +96,19 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
     # No larger than needed: OpenGL clears and resolves the whole buffer for every picture.
     visual.offwidth = max(PORTRAIT_SIZE[0], render_size[0])
     visual.offheight = max(PORTRAIT_SIZE[1], render_size[1])
+    return compiled(spec, path, " with the rig")
+
+
+def compiled(spec: "mujoco.MjSpec", path: Path | str, beside: str = "") -> "mujoco.MjModel":
+    """Compile a scene.
+
+    Raises:
+        ConfigError: it does not compile; the message names the file, and what is ``beside`` the scene.
+    """
     try:
         return spec.compile()
     except ValueError as error:
-        raise ConfigError(f"{path}: does not compile with the rig: {' '.join(str(error).split())}") from None
-
-
-def _target_spec(target: Target) -> "mujoco.MjSpec":
-    """Read a target's model, scaled to its true size and with its marker."""
-    kind = target.kind
-    if kind.own is not None:
-        return own_model(kind.own, kind.name, BOARD_GROUP)
-    asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{kind.name}.xml"))
-    scale_spec(asset, target.size)
-    change_marker(asset, target.name)
-    return asset
+        raise ConfigError(f"{path}: does not compile{beside}: {' '.join(str(error).split())}") from None
 
 
 def has_clutter(sim: SimConfig) -> bool:
@@ -153,10 +151,7 @@ def _site_pose(scene: Path, changed: int) -> RigidTransform:
     Raises:
         ConfigError: the scene does not compile.
     """
-    try:
-        return mount_pose(mujoco.MjSpec.from_file(str(scene)).compile())
-    except ValueError as error:
-        raise ConfigError(f"{scene}: does not compile: {' '.join(str(error).split())}") from None
+    return mount_pose(compiled(mujoco.MjSpec.from_file(str(scene)), scene))
 
 
 def _place(body: "mujoco.MjsBody", T: RigidTransform) -> None:

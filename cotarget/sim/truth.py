@@ -3,16 +3,16 @@
 Poses come from MuJoCo's kinematics and pixels from the true lenses. The pipeline's geometry is not used, so that a
 mistake in it cannot hide here.
 
-Two classes implement the Protocol `Appearances`. `Truth` moves all bodies to their poses and projects all of their
-corners. `Outlines` is faster and a little less exact: it prepares each target's outermost points for phases of the limb
-cycle. Environments use it, because they ask at every frame. Measurements: docs/design-notes.md.
+`Truth` moves all bodies to their poses and projects all of their corners. `Outlines` tells the same of the targets'
+outlines faster and a little less exactly: it prepares each target's outermost points for phases of the limb cycle.
+Environments use it, because they ask at every frame. Measurements: docs/design-notes.md.
 """
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import Literal, NamedTuple, Protocol, get_args
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -20,12 +20,11 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from cotarget.config import SimConfig
-from cotarget.errors import ConfigError
-from cotarget.files import assets_dir
 from cotarget.geometry import Array, RigidTransform, Rotation
-from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP, mount_pose, scene_spec
+from cotarget.sim.model import BOARD_GROUP, RIG, compiled, mount_pose, scene_spec
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.render.optics import TrueLens, fold
+from cotarget.sim.targets.models import kind_model
 from cotarget.sim.targets.target import Target, kind_of
 
 CameraName = Literal["fixed", "zoom"]
@@ -55,39 +54,6 @@ class Silhouette:
         return self.high_px - self.low_px
 
 
-class Appearances(Protocol):
-    """True image positions of the targets in both cameras, at any time up to now."""
-
-    @property
-    def targets(self) -> Mapping[str, Target]:
-        """Targets by name."""
-
-    @property
-    def fixed_lens(self) -> TrueLens:
-        """True optics of the fixed camera."""
-
-    @property
-    def longest_px(self) -> float:
-        """True longest focal length of the zoom camera, along the rows [px]."""
-
-    def lens(self, camera: CameraName, t: float) -> TrueLens:
-        """Give the true optics of a camera at time t [s]."""
-
-    def center_px(self, name: str, camera: CameraName, t: float) -> Array:
-        """Project a target's body centre at time t [s], (2,) [px]; nan behind the camera."""
-
-    def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
-        """Bound a target's outline at time t [s]: top-left and bottom-right corner, (2,) [px]; None behind camera."""
-
-    def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
-        """Give a target's outline and visible fraction at time t [s]; None behind the camera."""
-
-    def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
-        """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind."""
-
-
-# Visibility of given paths in another scene
-
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -101,29 +67,31 @@ def part_seen(sim: SimConfig, x_world: Array) -> float:
     Raises:
         ConfigError: the scene does not compile.
     """
-    try:
-        model = scene_spec(sim.scene).compile()
-    except ValueError as error:
-        raise ConfigError(f"{sim.scene}: does not compile: {' '.join(str(error).split())}") from None
-    T_world_fixed, camera = mount_pose(model), sim.fixed
+    model, camera = compiled(scene_spec(sim.scene), sim.scene), sim.fixed
+    data, T_world_fixed = mujoco.MjData(model), mount_pose(model)
+    mujoco.mj_kinematics(model, data)
     distortion = camera.distortion if sim.effects.distortion else NO_DISTORTION
     lens = TrueLens(camera.size, camera.focal_px, camera.center_px, distortion)
     pixels = lens.project(T_world_fixed.inv().apply(x_world))
     inside = ((pixels > -0.5) & (pixels < np.array(camera.size) - 0.5)).all(axis=1)  # nan is not
-    return float((inside & _free(model, T_world_fixed.translation, x_world)).mean())
+    ways = x_world - T_world_fixed.translation
+    far = np.linalg.norm(ways, axis=1)
+    hit, distance = _first_hits(model, data, T_world_fixed.translation, ways / far[:, None])
+    return float((inside & ((hit < 0) | (distance > far))).mean())
 
 
-def _free(model: "mujoco.MjModel", eye: Array, x_world: Array) -> npt.NDArray[np.bool_]:
-    """Check for each point (n, 3) that no drawn geom lies between it and a camera's optical centre (3,)."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    ways = x_world - eye
-    far, count = np.linalg.norm(ways, axis=1), len(ways)
+def _first_hits(
+    model: "mujoco.MjModel", data: "mujoco.MjData", eye: Array, ways: Array
+) -> tuple[npt.NDArray[np.int32], Array]:
+    """Find the first drawn geom along rays from a point, (n,) ids, and its distance in lengths of ``ways``, (n,).
+
+    The id is -1 where a ray meets none. Board and rig are left out.
+    """
     groups = (np.arange(mujoco.mjNGROUP) < BOARD_GROUP).astype(np.uint8)
+    count, farthest = len(ways), float(mujoco.mjMAXVAL)
     hit, distance = np.zeros(count, dtype=np.int32), np.zeros(count)
-    rays = (ways / far[:, None]).ravel()
-    mujoco.mj_multiRay(model, data, eye, rays, groups, True, -1, hit, distance, None, count, float(mujoco.mjMAXVAL))
-    return np.asarray((hit < 0) | (distance > far))
+    mujoco.mj_multiRay(model, data, eye, ways.ravel(), groups, True, -1, hit, distance, None, count, farthest)
+    return hit, distance
 
 
 SURFACE_POINTS = 64  # samples on a round geom; the outline's error is then about 1 %
@@ -160,7 +128,6 @@ class Truth:
         nominal_at: nominal focal length of the zoom camera at a time [px].
         zoom_lens_for: true optics of the zoom camera at a nominal focal length [px].
         T_world_fixed: pose of the fixed camera.
-        T_world_base: pose of the pan-tilt unit.
         head_at: true pan and tilt of the platform at a time [rad].
         focal_range: shortest and longest nominal focal length of the zoom camera [px].
         targets: targets by name.
@@ -173,13 +140,9 @@ class Truth:
     nominal_at: Callable[[float], float]
     zoom_lens_for: Callable[[float], TrueLens]
     T_world_fixed: RigidTransform
-    T_world_base: RigidTransform
     head_at: Callable[[float], tuple[float, float]]
     focal_range: tuple[float, float]
     targets: Mapping[str, Target]
-    _surfaces: dict[str, "Surface"] = field(default_factory=dict)
-    _bodies: dict[str, int] = field(default_factory=dict)
-    _scratch: list["mujoco.MjData"] = field(default_factory=list)
 
     def lens(self, camera: CameraName, t: float) -> TrueLens:
         """Give the true optics of a camera at time t [s]."""
@@ -218,7 +181,7 @@ class Truth:
             nominal_px: nominal focal length of the zoom lens [px].
             x_world: the point in the world [m], (3,).
         """
-        data = self._spare_data()
+        data = self._spare_data
         data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
         mujoco.mj_kinematics(self.model, data)
         lens = self.zoom_lens_for(nominal_px)
@@ -241,7 +204,7 @@ class Truth:
         low, high = pixels.min(axis=0), pixels.max(axis=0)
         inside = 1.0
         if (low < -0.5).any() or (high > np.array(lens.size) - 0.5).any():
-            parts = np.split(pixels, self._surface(name).starts[1:])
+            parts = np.split(pixels, self._surfaces[name].starts[1:])
             inside = _fraction_inside(parts, low, high, lens.size)
         return Silhouette(low, high, inside * self._unhidden(name, data, view[0]))
 
@@ -278,20 +241,29 @@ class Truth:
 
     def _copy(self, data: "mujoco.MjData") -> "mujoco.MjData":
         """Copy a state to data that may be changed; the world caches its own until another time is requested."""
-        copy = self._spare_data()
+        copy = self._spare_data
         copy.qpos[:], copy.mocap_pos[:], copy.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
         mujoco.mj_kinematics(self.model, copy)
         return copy
 
+    @cached_property
     def _spare_data(self) -> "mujoco.MjData":
-        """Give data that may be changed, in any state."""
-        if not self._scratch:
-            self._scratch.append(mujoco.MjData(self.model))
-        return self._scratch[0]
+        """Data that may be changed, in any state."""
+        return mujoco.MjData(self.model)
+
+    @cached_property
+    def _bodies(self) -> dict[str, int]:
+        """Ids of the cameras' bodies."""
+        return {camera: self.model.body(RIG + camera).id for camera in get_args(CameraName)}
+
+    @cached_property
+    def _surfaces(self) -> dict[str, Surface]:
+        """Points on the geoms of each target."""
+        return {name: self._surface_of(target) for name, target in self.targets.items()}
 
     def _outline(self, name: str, data: "mujoco.MjData", view: tuple[Array, Array], lens: TrueLens) -> Array:
         """Project the points on a target's geoms, in their order, (n, 2) [px]; nan where the camera images none."""
-        surface = self._surface(name)
+        surface = self._surfaces[name]
         axes = data.geom_xmat[surface.geoms].reshape(-1, 3, 3)
         x_world = np.einsum("nij,nj->ni", axes[surface.owner], surface.points)
         eye, camera_axes = view
@@ -299,37 +271,25 @@ class Truth:
 
     def _camera(self, data: "mujoco.MjData", camera: CameraName, lens: TrueLens) -> tuple[Array, Array]:
         """Give a camera's entrance pupil in the world [m], (3,), and its axes as columns, (3, 3)."""
-        if camera not in self._bodies:
-            self._bodies[camera] = self.model.body(RIG + camera).id
         body = self._bodies[camera]
         axes = np.array(data.xmat[body].reshape(3, 3))
         return data.xpos[body] + axes[:, 2] * lens.pupil, axes
 
-    def _surface(self, name: str) -> "Surface":
-        """Give the points on a target's geoms, computed once."""
-        if name not in self._surfaces:
-            root = self.model.body(self.targets[name].body).id
-            geoms = np.flatnonzero(self.model.body_rootid[self.model.geom_bodyid] == root)
-            points = [surface_points(self.model, int(geom)) for geom in geoms]
-            counts = [len(each) for each in points]
-            self._surfaces[name] = Surface(
-                geoms, np.repeat(np.arange(len(geoms)), counts), np.cumsum([0, *counts[:-1]]), np.concatenate(points)
-            )
-        return self._surfaces[name]
+    def _surface_of(self, target: Target) -> Surface:
+        root = self.model.body(target.body).id
+        geoms = np.flatnonzero(self.model.body_rootid[self.model.geom_bodyid] == root)
+        points = [surface_points(self.model, int(geom)) for geom in geoms]
+        counts = [len(each) for each in points]
+        owner, starts = np.repeat(np.arange(len(geoms)), counts), np.cumsum([0, *counts[:-1]])
+        return Surface(geoms, owner, starts, np.concatenate(points))
 
     def _unhidden(self, name: str, data: "mujoco.MjData", eye: Array) -> float:
         """Compute the fraction of the target's geoms whose centre a ray from the camera reaches unoccluded.
 
         Geoms inside and outside the image count the same. A mesh's centre is its centre of mass.
         """
-        own = self._surface(name).geoms
-        groups = np.ones(mujoco.mjNGROUP, dtype=np.uint8)
-        groups[[BOARD_GROUP, RIG_GROUP, FRAME_GROUP]] = 0
-        hit, distance = np.zeros(len(own), dtype=np.int32), np.zeros(len(own))
-        ways = (data.geom_xpos[own] - eye).ravel()
-        mujoco.mj_multiRay(
-            self.model, data, eye, ways, groups, True, -1, hit, distance, None, len(own), float(mujoco.mjMAXVAL)
-        )
+        own = self._surfaces[name].geoms
+        hit, _ = _first_hits(self.model, data, eye, data.geom_xpos[own] - eye)
         return float(np.isin(hit, own).mean())
 
 
@@ -409,7 +369,13 @@ class TrueView(NamedTuple):
 
 
 class Outlines:
-    """Fast approximation of `Truth` for the targets' outlines (see `Appearances`)."""
+    """Fast approximation of `Truth` for the targets' outlines.
+
+    Attributes:
+        targets: targets by name.
+        fixed_lens: true optics of the fixed camera.
+        longest_px: true longest focal length of the zoom camera, along the rows [px].
+    """
 
     def __init__(self, truth: Truth, still: bool) -> None:
         """Prepare each target's outermost points.
@@ -419,38 +385,23 @@ class Outlines:
             still: whether only targets and rig move. A single target that no static geom can occlude then counts as
                 visible without a test by rays.
         """
+        self.targets, self.fixed_lens, self.longest_px = truth.targets, truth.fixed_lens, truth.longest_px
         self._truth, self._model, self._data = truth, truth.model, mujoco.MjData(truth.model)
         mujoco.mj_kinematics(self._model, self._data)
         data = self._data  # reading an array attribute takes as long as the computation with it
         self._qpos, self._places, self._turns = data.qpos, data.xpos, data.xmat.reshape(-1, 3, 3)
-        self._points = {name: outermost(each.kind.name) * each.size for name, each in truth.targets.items()}
+        self._points = {name: outermost(each.kind.name) * each.size for name, each in self.targets.items()}
         self._beats = {name: np.concatenate(points[::EVERY], axis=1) for name, points in self._points.items()}
         self._reach = {name: float(np.linalg.norm(points, axis=1).max()) for name, points in self._points.items()}
         self._axes = [int(self._model.joint(RIG + axis).qposadr[0]) for axis in ("pan", "tilt")]
         self._bodies = {camera: self._model.body(RIG + camera).id for camera in get_args(CameraName)}
-        self._exposed = still and len(truth.targets) == 1 and self._stands_free(*truth.targets)
-        self._longest_px = truth.longest_px
-        self._fixed = self._placed("fixed", truth.fixed_lens)
+        self._exposed = still and len(self.targets) == 1 and self._stands_free(*self.targets)
+        self._fixed = self._placed("fixed", self.fixed_lens)
         # Cached results for the latest time, and for the zoom camera's latest pan, tilt and focal length.
         self._t = self._zoom_t = math.nan
         self._zoom, self._stood = self._fixed, (math.nan, math.nan, math.nan)
         self._poses: dict[str, tuple[Array, Array, int]] = {}
         self._found: dict[tuple[str, CameraName], Outline | None] = {}
-
-    @property
-    def targets(self) -> Mapping[str, Target]:
-        """Targets by name."""
-        return self._truth.targets
-
-    @property
-    def fixed_lens(self) -> TrueLens:
-        """True optics of the fixed camera."""
-        return self._truth.fixed_lens
-
-    @property
-    def longest_px(self) -> float:
-        """True longest focal length of the zoom camera, along the rows [px]."""
-        return self._longest_px
 
     def lens(self, camera: CameraName, t: float) -> TrueLens:
         """Give the true optics of a camera at time t [s]."""
@@ -486,7 +437,7 @@ class Outlines:
         if across <= 0 or down <= 0:
             return Silhouette(low, high, 0.0)
         inside = across * down / ((right - left) * (bottom - top))
-        return Silhouette(low, high, inside * self._unhidden(name, camera, t))
+        return Silhouette(low, high, inside if self._exposed else inside * self._truth.unhidden(name, camera, t))
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
         """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind."""
@@ -527,8 +478,8 @@ class Outlines:
         self._at(t)
         if name not in self._poses:
             target = self.targets[name]
-            beat = target.beat(t)
-            position, axes, _ = target.stance(t, beat)
+            beat = target.kind.beat(target, t)
+            position, axes, _ = target.kind.stance(target, t, beat)
             phase = round(beat / (2 * math.pi) * PHASES) % PHASES
             self._poses[name] = np.array(position), np.array(axes).T, phase
         return self._poses[name]
@@ -563,12 +514,12 @@ class Outlines:
         way = np.array([path.position(t) for t in path.spline.x])
         eyes = data.xpos[list(self._bodies.values())]
         reach = self._reach[name] + ROOM
-        lever = float(np.linalg.norm(data.xpos[self._bodies["zoom"]] - self._truth.T_world_base.translation))
+        lever = float(np.linalg.norm(data.xpos[self._bodies["zoom"]] - data.xpos[model.body(RIG + "base").id]))
         room = ROOM + 2 * lever  # the head carries the zoom camera round
         low = np.minimum(way.min(axis=0) - reach, eyes.min(axis=0) - room)
         high = np.maximum(way.max(axis=0) + reach, eyes.max(axis=0) + room)
         root = model.body_rootid[model.geom_bodyid]
-        standing = (model.body_mocapid[root] < 0) & ~np.isin(model.geom_group, (BOARD_GROUP, RIG_GROUP, FRAME_GROUP))
+        standing = (model.body_mocapid[root] < 0) & (model.geom_group < BOARD_GROUP)
         for geom in np.flatnonzero(standing):
             turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
@@ -581,9 +532,8 @@ class Outlines:
                 return False
         return True
 
-    def _unhidden(self, name: str, camera: CameraName, t: float) -> float:
-        """Compute the fraction of a target's geoms that only the target itself occludes."""
-        return 1.0 if self._exposed else self._truth.unhidden(name, camera, t)
+
+Appearances = Truth | Outlines  # what tells where the targets are in both images
 
 
 def _ends(values: Array) -> tuple[Array, Array]:
@@ -601,7 +551,7 @@ def outermost(kind: str) -> Array:
     Returns:
         Points in the body's frame, at the model's own size [m], (PHASES, 3, n).
     """
-    model = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{kind}.xml")).compile()
+    model = kind_model(kind).compile()
     data, body = mujoco.MjData(model), model.body(kind).id
     surfaces, limbs = [surface_points(model, geom) for geom in range(model.ngeom)], kind_of(kind).limbs
     directions = sphere_points(DIRECTIONS)

@@ -1,5 +1,6 @@
 """Simulated world: poses and images as functions of time, the rig's devices, and ground truth."""
 
+import logging
 from collections.abc import Collection
 from contextlib import ExitStack
 from dataclasses import replace
@@ -20,10 +21,9 @@ from cotarget.sim.devices import (
     lens_drive,
     rig_spec,
 )
-from cotarget.sim.model import base_pose, build_model, has_clutter, mount_pose
+from cotarget.sim.model import build_model, has_clutter, mount_pose
 from cotarget.sim.render.optics import TrueLens, covering_size
-from cotarget.sim.render.pictures import SizedPictures
-from cotarget.sim.render.portrait import Portrait, portrait
+from cotarget.sim.render.pictures import Portrait, SizedPictures, portrait
 from cotarget.sim.render.sensor import Sensor
 from cotarget.sim.render.views import Ahead, Views, is_allowed
 from cotarget.sim.state import WorldState
@@ -34,9 +34,14 @@ from cotarget.sim.zoom_lens import optics_at
 
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 # Random streams of the sensors' noise, so that the draws of one effect never shift those of another.
-FIXED_NOISE, ZOOM_NOISE = 1, 2
+NOISE = {"fixed": 1, "zoom": 2}
 # The render's size is computed from this many focal lengths of the zoom lens; its optics vary smoothly between them.
 SIZED_FOCALS = 17
+# Check of a given path: times at which it is looked for in the fixed camera's view, and the distance beyond which a
+# target is less than a pixel [m].
+PATH_SAMPLES, FARTHEST = 200, 1000.0
+
+log = logging.getLogger(__name__)
 
 
 class SimWorld:
@@ -83,21 +88,19 @@ class SimWorld:
             self._views()
         ahead = ahead and is_allowed() and "zoom" in self._rendered
         self._ahead = Ahead(self._views().apart) if ahead else None
-        self._black = {name: _black(self._camera(name)) for name in CAMERAS}
-        streams = {"fixed": FIXED_NOISE, "zoom": ZOOM_NOISE}
-        self._sensors = {
-            name: Sensor(self._camera(name), effects, (sim.seed, streams[name])) for name in self._rendered
-        }
+        self._black = {name: np.zeros((*self._camera(name).size[::-1], 3), dtype=np.uint8) for name in CAMERAS}
+        self._sensors = {name: Sensor(self._camera(name), effects, (sim.seed, NOISE[name])) for name in self._rendered}
         spec = rig_spec(config)
         fixed = SimStream(sim.fixed, effects, self._clock, partial(self.expose, "fixed"))
         zoom = SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, self.lens_drive, spec.zoom.delay_s)
-        head = SimPanTilt(sim.head, effects, self._clock, self.head_drive)
+        head = SimPanTilt(spec.head, self._clock, self.head_drive)
         board = SimBoard(self._place_board)
         self._of_world = (fixed, zoom, board)
         self._release = ExitStack()
         self._release.callback(self.close)
         self._release.callback(head.halt)
         self.rig = Rig(fixed, zoom, head, self._clock, board, spec, self._release.close, config)
+        self._warn_of_unseen_paths()
 
     def truth(self) -> Truth:
         """Give the ground truth, for tests and experiments only."""
@@ -109,15 +112,10 @@ class SimWorld:
             nominal_at=self.lens_drive.focal_at,
             zoom_lens_for=self.zoom_lens_for,
             T_world_fixed=self._T_world_fixed,
-            T_world_base=base_pose(self._T_world_fixed, self.config.sim),
             head_at=self.head_drive.angles_at,
             focal_range=self.rig.zoom.focal_range,
             targets=self.targets,
         )
-
-    def zoom_lens_at(self, t: float) -> TrueLens:
-        """Give the zoom camera's true optics at a time up to now [s]."""
-        return self.zoom_lens_for(self.lens_drive.focal_at(t))
 
     def zoom_lens_for(self, nominal_px: float) -> TrueLens:
         """Give the zoom camera's true optics at a nominal focal length [px]."""
@@ -192,7 +190,7 @@ class SimWorld:
         return [self._fixed_lens, *zooms]
 
     def _lens_at(self, name: CameraName, t: float) -> TrueLens:
-        return self.zoom_lens_at(t) if name == "zoom" else self._fixed_lens
+        return self.zoom_lens_for(self.lens_drive.focal_at(t)) if name == "zoom" else self._fixed_lens
 
     def expose(self, name: CameraName, index: int, t: float) -> Image:
         """Render the exposure around time t [s], up to now, and add the sensor's effects of frame number ``index``."""
@@ -217,10 +215,21 @@ class SimWorld:
             self._ahead.begin(index + 1, lambda views: self._exposed(views, "zoom", index + 1, after))
         return image
 
+    def _warn_of_unseen_paths(self) -> None:
+        """Say which given paths never lead through the fixed camera's view, as those in millimetres do not."""
+        size = np.array(self._fixed_lens.size)
+        for name in (each for each in self.targets if each in self.config.sim.paths):
+            spline = self.targets[name].path.spline
+            x_fixed = self._T_world_fixed.inv().apply(spline(np.linspace(spline.x[0], spline.x[-1], PATH_SAMPLES)))
+            pixels = self._fixed_lens.project(x_fixed)
+            inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1)  # nan is not
+            if not (inside & (x_fixed[:, 2] <= FARTHEST)).any():
+                log.warning(
+                    "sim.paths.%s: is never in the fixed camera's view up to %g m away; a path is [[t, x, y, z], ...] "
+                    "in seconds and metres, in the scene's world",
+                    name,
+                    FARTHEST,
+                )
+
     def _place_board(self, T_fixed_board: RigidTransform | None, swings: bool) -> None:
         self._state.place_board(self._clock.now(), T_fixed_board, swings)
-
-
-def _black(camera: SimCamera) -> Image:
-    """Make the image of a camera that is not rendered."""
-    return np.zeros((camera.size[1], camera.size[0], 3), dtype=np.uint8)

@@ -27,7 +27,7 @@ from cotarget.errors import ConfigError, choices
 from cotarget.evaluation import closeup_of, on_target
 from cotarget.pipeline import FollowSettings, Step
 from cotarget.sim.targets.person import PERSON_HEIGHT
-from cotarget.sim.targets.target import draw_size, target_rng
+from cotarget.sim.targets.target import true_size
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine.harness import Experiment, Row, seeds_of
@@ -130,7 +130,7 @@ def _crossing(rng: np.random.Generator, number: int, away: float, name: str, see
     """Make a straight path across the view at a distance [m]; successive persons start from alternate sides."""
     side, speed = (1.0 if number % 2 else -1.0), rng.uniform(*SPEED)
     enters = ENTERS_S + LATER_S * number + rng.uniform(0.0, EARLIER_S)
-    half, z = EDGE * away, PERSON_HEIGHT / 2 * draw_size(name, target_rng(seed, name), scatter=True)
+    half, z = EDGE * away, PERSON_HEIGHT / 2 * true_size(name, seed)
     t = np.arange(enters - 2.0, enters + 2 * half / speed + 2.0, KNOT_S)
     return tuple((float(each), float(side * (half - speed * (each - enters))), away, z) for each in t)
 

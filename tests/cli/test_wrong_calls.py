@@ -153,7 +153,7 @@ CALLS = [
     ("aim --calibration wide.json --pixel 3 4 --depth 5 --rig rig.toml", FAILED, "wide.json: ", "640x360"),
     # follow and replay
     (f"{TARGET} cat", FAILED, "--target", "'cat'"),
-    ("follow --calibration good.json --rig dog.toml --target dog", FAILED, "dog.toml", "bird, book, person"),
+    ("follow --calibration good.json --rig dog.toml --target dog", FAILED, "dog.toml", "[sim] targets"),
     ("follow --calibration good.json --rig hw.toml --target book", FAILED, "good.json: ", "704x576"),
     ("follow --calibration good.json --rig replay.toml --target book", FAILED, "none: "),
     ("follow --calibration good.json --rig of_nothing.toml --target book", FAILED, "of_nothing.toml: recording"),

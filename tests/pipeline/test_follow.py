@@ -9,7 +9,7 @@ import pytest
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import DEFAULT_TARGETS, RigConfig, SimConfig
+from cotarget.config import DEFAULT_TARGETS, RigConfig
 from cotarget.control.selection import FirstCome
 from cotarget.control.zoom import ZoomSettings
 from cotarget.detection import Detection
@@ -476,8 +476,9 @@ def test_a_picture_that_changes_as_a_whole_is_told():
 ])  # fmt: skip
 def test_a_wrong_argument_is_refused_with_the_first_step(arguments, said):
     rig = Rig()
-    config = RigConfig(sim=SimConfig(targets=("book",)))
-    steps = follow(rig_of(rig, config=config), CALIBRATION, **{"target": BOOK, "detector": Seer(still), **arguments})
+    whole = rig_of(rig, config=RigConfig())
+    whole = replace(whole, spec=replace(whole.spec, targets=("book",)))
+    steps = follow(whole, CALIBRATION, **{"target": BOOK, "detector": Seer(still), **arguments})
     with pytest.raises(ConfigError) as raised:
         next(steps)
     assert str(raised.value).startswith(said)

@@ -11,19 +11,9 @@ from cotarget.errors import ConfigError
 from cotarget.geometry import pose
 from cotarget.sim.model import BOARD
 from cotarget.sim.world import SimWorld
+from tests.support.target_models import BOX, CORNERS, FACES, mesh
 
-# A box 1 m long, 0.4 m wide and 0.6 m high, as a file of triangles; x is forward.
-CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.2, 0.2) for z in (-0.3, 0.3)])
-FACES = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
 ASIDE = np.array([0.2, 0.0, 0.3])  # a mesh's origin need not be its middle
-
-
-def mesh(corners, faces):
-    """An .obj file."""
-    return "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "".join(f"f {' '.join(map(str, f))}\n" for f in faces)
-
-
-BOX = mesh(CORNERS, FACES)
 BOX_XML = """<mujoco><worldbody><body><freejoint/><geom type="box" pos="0 0 -.2" size=".5 .2 .1"/>
   <body pos="0 0 .1"><joint name="lid"/><geom type="box" size=".5 .2 .2"/></body></body></worldbody></mujoco>"""
 # The same as models of robots are: it moves by itself, and collides as what is larger than what is seen.
@@ -125,21 +115,21 @@ def test_the_scene_may_have_a_board_of_its_own(folder):
         np.testing.assert_allclose(data.body(BOARD).xpos, [7, 0, 2], atol=NEAR_M)  # 4 m before the camera
 
 
-@pytest.mark.parametrize(("old", "new", "said"), [
-    ("dog.obj", "cat.obj", "cat.obj: no such file; give the path of a mesh or an MJCF file"),
-    ("dog.obj", "dog.gltf", "sim.models.dog: dog.gltf is not one of: .obj, .stl, .xml"),
-    ("dog.obj", "yard.xml", "yard.xml: has 0 bodies in its worldbody; a target is one, with its parts in it"),
-    ("dog.obj", "bad.obj", "bad.obj: is not a target's model: "),
-    ("dog.obj", "plane.xml", "plane.xml: has a geom of type plane; what a target is made of is: box, capsule, "),
-    ("dog.obj", "hidden.xml", "hidden.xml: shows nothing: it has no geom of the groups 0 to 2"),
-    ("dog.obj", "nothing.xml", "nothing.xml: shows nothing: it has no geom of the groups 0 to 2"),
-    ("dog.obj", "mm.obj", "mm.obj: a part is 1233 m large; models are in metres, and this one seems to be in mm"),
-    ("dog = \"", "bird = \"", "sim.models.bird: the simulation has a bird of its own; give yours another name"),
-    ("dog = \"", "dog2 = \"", "sim.models.dog2: a model is of a kind; give its name without the number"),
-    ("dog2 = [[", "dog3 = [[", "sim.targets: a dog2 of your own needs a path: [sim.paths] dog2 = [[t, x, y, z], ...]"),
-    ('[sim.models]\ndog = "dog.obj"', "", "unknown target 'dog'; the simulation has: bird, book, person, and"),
+@pytest.mark.parametrize(("old", "new", "named"), [
+    ("dog.obj", "cat.obj", "sim.models.dog: cat.obj: "),
+    ("dog.obj", "dog.gltf", "rig.toml: sim.models.dog: dog.gltf "),
+    ("dog.obj", "yard.xml", "yard.xml: has 0 bodies"),
+    ("dog.obj", "bad.obj", "bad.obj: "),
+    ("dog.obj", "plane.xml", "plane.xml: has a geom of type plane"),
+    ("dog.obj", "hidden.xml", "hidden.xml: shows nothing"),
+    ("dog.obj", "nothing.xml", "nothing.xml: shows nothing"),
+    ("dog.obj", "mm.obj", "mm.obj: a part is 1233 m large"),
+    ("dog = \"", "bird = \"", "rig.toml: sim.models.bird: "),
+    ("dog = \"", "dog2 = \"", "rig.toml: sim.models.dog2: "),
+    ("dog2 = [[", "dog3 = [[", "rig.toml: sim.targets: a dog2 of your own needs a path"),
+    ('[sim.models]\ndog = "dog.obj"', "", "rig.toml: sim.targets: unknown target 'dog'"),
 ])  # fmt: skip
-def test_what_cannot_be_is_refused_in_one_line(folder, monkeypatch, old, new, said):
+def test_what_cannot_be_is_refused_in_one_line(folder, monkeypatch, old, new, named):
     monkeypatch.chdir(folder)
     (folder / "bad.obj").write_text("v 1 2\n")
     (folder / "mm.obj").write_text(mesh(1000 * CORNERS, FACES))
@@ -152,5 +142,18 @@ def test_what_cannot_be_is_refused_in_one_line(folder, monkeypatch, old, new, sa
     changed(folder, old, new)
     with pytest.raises(ConfigError) as error:
         SimWorld(load_config(Path("rig.toml")), rendered=())
-    assert said in str(error.value)
+    assert str(error.value).startswith(named)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("path", "unseen"), [
+    ("[[0, 13, 0, 2], [10, 13, 5, 2]]", False),
+    ("[[0, 13, -90, 2], [10, 13, 90, 2]]", False),  # it comes through
+    ("[[0, 13000, 0, 2000], [10, 13000, 5000, 2000]]", True),  # in millimetres
+    ("[[0, -13, 0, 2], [10, -13, 5, 2]]", True),  # behind the camera
+])  # fmt: skip
+def test_a_path_that_is_never_in_view_is_told(folder, caplog, path, unseen):
+    changed(folder, "[[0, 13, 0, 2], [10, 13, 5, 2]]", path)
+    SimWorld(load_config(folder / "rig.toml"), rendered=()).close()
+    told = [record.getMessage() for record in caplog.records]
+    assert [line.partition(": ")[0] for line in told if "dog:" in line] == ["sim.paths.dog"] * unseen

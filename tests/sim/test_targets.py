@@ -1,18 +1,15 @@
 """The simulated targets: their paths, gaits and sizes, and the models that carry them."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cotarget.errors import ConfigError
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.targets import KINDS
-from cotarget.sim.targets.paths import MOUNT, waypoint_path
-from cotarget.sim.targets.target import make_target, scale_spec
+from cotarget.sim.targets.models import kind_model, scale_spec
+from cotarget.sim.targets.paths import MOUNT
+from cotarget.sim.targets.target import make_target
 
-ASSETS = Path(__file__).parents[2] / "sim_assets"
 SEEDS = range(3)
 SECONDS = np.arange(0.0, 40.0, 0.1)
 HALF_WIDTH, HALF_HEIGHT = 25.0, 19.0  # the wide view [degrees]
@@ -33,7 +30,7 @@ def bearings(points, scene):
 
 
 def positions(target):
-    return np.array([target.pose(t).T_world_target.translation for t in SECONDS])
+    return np.array([target.pose(t).position for t in SECONDS])
 
 
 def make(name, scene="indoor", seed=0, scatter=False, waypoints=None):
@@ -111,9 +108,9 @@ def test_motion_is_smooth(name, scene, where):
     step = 0.01
     times = np.arange(0.0, 12.0, step) + (target.path.lap[1] - 6.0 if where != "the beginning" else 0.0)
     poses = [target.pose(t) for t in times]
-    acceleration = np.diff([p.T_world_target.translation for p in poses], 2, axis=0) / step**2
+    acceleration = np.diff([p.position for p in poses], 2, axis=0) / step**2
     assert np.abs(acceleration).max() < 12.0  # 5 m/s round 2.5 m takes 10 m/s^2
-    turned = Rotation.concatenate([p.T_world_target.rotation for p in poses])
+    turned = Rotation.concatenate([p.rotation for p in poses])
     turn = (turned[:-1].inv() * turned[1:]).magnitude()
     assert np.max(turn) / step < 4.0  # rad/s: no jump of heading or bank
     for joint in poses[0].joints:
@@ -155,19 +152,19 @@ def test_sizes_scatter_within_bounds(name, most):
 def test_book_shows_its_cover_to_the_camera():
     target = make("book")
     for t in SECONDS[::20]:
-        T = target.pose(t).T_world_target
-        to_mount = MOUNT - T.translation
-        cosine = T.rotation.apply([1.0, 0.0, 0.0]) @ to_mount / np.linalg.norm(to_mount)
+        pose = target.pose(t)
+        to_mount = MOUNT - pose.position
+        cosine = pose.rotation.apply([1.0, 0.0, 0.0]) @ to_mount / np.linalg.norm(to_mount)
         assert cosine > np.cos(np.radians(12.0))
 
 
 def test_walker_looks_where_it_goes_and_keeps_its_feet_on_the_ground():
     target = make("person")
-    model = mujoco.MjModel.from_xml_path(str(ASSETS / "targets" / "person.xml"))
+    model = kind_model("person").compile()
     data = mujoco.MjData(model)
     for t in np.arange(4.0, 6.0, 0.05):
         pose = target.pose(t)
-        forward = pose.T_world_target.rotation.apply([1.0, 0.0, 0.0])
+        forward = pose.rotation.apply([1.0, 0.0, 0.0])
         velocity = target.path.velocity(t)
         assert forward @ velocity > 0.999 * np.linalg.norm(velocity)
         for joint, angle in pose.joints.items():
@@ -177,7 +174,7 @@ def test_walker_looks_where_it_goes_and_keeps_its_feet_on_the_ground():
             data.geom(g).xpos[2] for g in range(model.ngeom) if model.geom_matid[g] == model.material("person_shoe").id
         ]
         standing = -0.875 + 0.04  # a shoe's middle is some 4 cm above its sole
-        assert abs(pose.T_world_target.translation[2] + min(shoes) - (0.875 + standing)) < 0.05
+        assert abs(pose.position[2] + min(shoes) - (0.875 + standing)) < 0.05
 
 
 def test_wings_beat_four_times_a_second():
@@ -192,35 +189,14 @@ def test_wings_beat_four_times_a_second():
 
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("factor", [1.0, 1.12])
-def test_model_has_the_size_that_it_claims(name, factor):
-    spec = mujoco.MjSpec.from_file(str(ASSETS / "targets" / f"{name}.xml"))
+def test_model_has_the_size_that_it_claims_and_the_joints_that_move(name, factor):
+    spec = kind_model(name)
+    assert {joint.name for joint in spec.joints} == set(make(name).pose(0.0).joints)
     scale_spec(spec, factor)
     low, high = extents(spec)
     axis, size = DIMENSION[name]
     assert (high - low)[axis] == pytest.approx(size * factor, rel=SIZE_TOLERANCE)
     assert (high + low)[axis] == pytest.approx(0.0, abs=SIZE_TOLERANCE * size)  # the origin is its middle
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_model_has_the_joints_that_move(name):
-    model = mujoco.MjModel.from_xml_path(str(ASSETS / "targets" / f"{name}.xml"))
-    assert {model.joint(j).name for j in range(model.njnt)} == set(make(name).pose(0.0).joints)
-    assert model.body(name).mocapid[0] == 0
-    assert not model.geom_contype.any()
-
-
-@pytest.mark.parametrize("scene", PITCH)
-def test_scene_takes_rig_and_targets_without_a_warning(scene):
-    spec = mujoco.MjSpec.from_file(str(ASSETS / "scenes" / f"{scene}.xml"))
-    for part in ("rig", *(f"targets/{name}" for name in KINDS)):
-        child = mujoco.MjSpec.from_file(str(ASSETS / f"{part}.xml"))
-        spec.attach(child, frame=spec.worldbody.add_frame(), prefix=f"{part}/")
-    model = spec.compile()
-    assert model.nmocap == len(KINDS)
-    assert model.vis.map.znear * model.stat.extent == pytest.approx(0.05, rel=1e-3)
-    assert model.vis.map.zfar * model.stat.extent >= 120
-    assert not model.geom_contype.any()
-    assert sum(model.light_castshadow) == 1
 
 
 def test_waypoints_replace_the_path():
@@ -230,30 +206,10 @@ def test_waypoints_replace_the_path():
         assert target.path.position(3.0) == pytest.approx([0.0, 9.0, 1.5])
         assert target.path.position(-5.0) == pytest.approx(way[0][1:])
         assert target.path.position(50.0) == pytest.approx(way[-1][1:])
-        assert np.all(np.isfinite(target.pose(50.0).T_world_target.as_matrix()))
-    held = make("person", waypoints=((0.0, 0.0, 8.0, 0.9),)).pose(3.0)
-    assert held.T_world_target.translation[:2] == pytest.approx([0.0, 8.0])
-    assert held.T_world_target.rotation.apply([1.0, 0.0, 0.0]) == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)
-
-
-def test_refuses_what_it_does_not_know():
-    with pytest.raises(ConfigError, match="book, person"):
-        make("dragon")
-    with pytest.raises(ConfigError, match="increase"):
-        waypoint_path(((1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0)))
-    with pytest.raises(ConfigError, match="at least one"):
-        waypoint_path(())
-
-
-@pytest.mark.parametrize(("name", "scene"), CASES)
-def test_a_stance_is_the_pose_in_floats(name, scene):
-    target = make(name, scene)
-    for t in SECONDS[::7]:
-        pose = target.pose(t)
-        position, axes, joints = target.stance(t, target.beat(t))
-        assert position == list(pose.position)
-        assert joints == pose.joints
-        np.testing.assert_allclose(np.transpose(axes), pose.rotation.as_matrix(), atol=1e-14)
+        assert np.isfinite(target.pose(50.0).rotation.as_matrix()).all()
+    held = make("person", waypoints=((0.0, 0.0, 8.0, 0.9), (9.0, 0.0, 8.0, 0.9))).pose(3.0)
+    assert held.position[:2] == pytest.approx([0.0, 8.0])
+    assert held.rotation.apply([1.0, 0.0, 0.0]) == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)
 
 
 @pytest.mark.parametrize("waypoints", [None, [[5, 1, 9, 2], [6, 2, 9, 3], [8, 2, 7, 2]]], ids=["loop", "waypoints"])

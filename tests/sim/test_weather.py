@@ -41,8 +41,9 @@ def test_plain_frame_differencing_finds_false_blobs(seed):
     assert rate >= ASKED_A_MINUTE
 
 
-def test_without_clutter_nothing_moves():
-    with (w := world(effects={"clutter": False})).rig:
+@pytest.mark.parametrize(("scene", "clutter"), [("outdoor", False), ("indoor", True)])
+def test_without_clutter_and_indoors_nothing_moves(scene, clutter):
+    with (w := world(scene, effects={"clutter": clutter})).rig:
         assert false_blobs_a_minute(w, 3.0) == 0
 
 
@@ -93,19 +94,9 @@ def test_foliage_stands_where_it_is_though_only_the_target_was_asked_for_before(
     assert np.abs(places[1] - places[0])[crowns].max() > 1e-3
 
 
-def test_indoors_nothing_changes():
-    images = []
-    for clutter in (False, True):
-        with (w := world("indoor", effects={"clutter": clutter})).rig:
-            images.append(w.expose("fixed", 5, 4.0))
-    np.testing.assert_array_equal(*images)
-
-
-def test_it_is_off_where_nobody_asks():
+def test_it_is_off_by_default():
     """The figures of calibration and demo are for a world at rest."""
     assert not SimEffects().clutter
-    assert not parse_config({"sim": {"effects": {"all": False}}}).sim.effects.clutter
-    assert parse_config({"sim": {"effects": {"clutter": True}}}).sim.effects.clutter
 
 
 def test_a_scene_of_ones_own_sways_where_it_says_so(tmp_path):

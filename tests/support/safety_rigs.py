@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from cotarget.config import SimEffects, SimHead
+from cotarget.config import RigConfig, SimEffects, SimHead
 from cotarget.errors import StaleFrameError
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState
-from cotarget.sim.devices import SimClock, SimPanTilt, head_drive
+from cotarget.sim.devices import SimClock, SimPanTilt, head_drive, rig_spec
 
 IMAGE = np.zeros((2, 2, 3), np.uint8)
 DEADLINE_S = 20.0  # for whatever must happen at all, on a machine that is busy with other things
@@ -43,9 +43,8 @@ class NotingHead(SimPanTilt):
     """The simulation's head, which notes what it is told and when, and does not halt when it is broken."""
 
     def __init__(self, clock):
-        effects = SimEffects()
-        self.drive = head_drive(SimHead(), effects)
-        super().__init__(SimHead(), effects, clock, self.drive)
+        self.drive = head_drive(SimHead(), SimEffects())
+        super().__init__(rig_spec(RigConfig()).head, clock, self.drive)
         self.clock, self.log, self.broken = clock, [], 0
 
     def move(self, pan, tilt, speed=None, wait=False):

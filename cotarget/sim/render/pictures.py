@@ -1,15 +1,19 @@
-"""Both cameras rendered at another size than their streams, for users of many small pictures.
+"""Pictures beside the cameras' streams: both cameras at another size, and the rig itself.
 
-The field of view is that of the streams, whatever the aspect ratio. The configured effects apply: exposure blur, sensor
-noise and JPEG. The pictures are rendered at the requested size and not scaled down to it.
+Pictures of another size are rendered at that size, for users of many small ones. Their field of view is that of the
+streams, whatever the aspect ratio. The configured effects apply: exposure blur, sensor noise and JPEG.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from cotarget.config import SimConfig
+from cotarget.geometry import Array
 from cotarget.rig import Image
-from cotarget.sim.render.opengl import Canvas, mujoco
+from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, PORTRAIT_SIZE, RIG, RIG_GROUP
+from cotarget.sim.render.opengl import Canvas, make_renderer, mujoco
 from cotarget.sim.render.optics import TrueLens, covering_size
 from cotarget.sim.render.sensor import Sensor
 from cotarget.sim.render.views import Views
@@ -84,3 +88,63 @@ def _resized(lens: TrueLens, size: tuple[int, int]) -> TrueLens:
     # The first pixel's centre is (0, 0), so that the image begins half a pixel before it.
     center = (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
     return TrueLens(size, (fx * across, fy * down), center, lens.distortion, lens.pupil)
+
+
+# Pictures of the rig itself
+
+FIELD_DEG = 40.0
+ELEVATION_DEG = -18.0
+CLOSEST = 1.25  # [m]
+FILL = 2.2  # ratio of the viewing distance to the rig's extent
+FRAMES = ("fixed", "zoom", "base")
+
+
+@dataclass(frozen=True)
+class Portrait:
+    """Picture of the rig, (H, W, 3) BGR, and the pixels of its frames' origins, (2,) each."""
+
+    image: Image
+    origins_px: dict[str, Array]
+
+
+def portrait(model: "mujoco.MjModel", data: "mujoco.MjData", azimuth_deg: float, axes: bool) -> Portrait:
+    """Render the rig in its current state.
+
+    Args:
+        model: the compiled world.
+        data: state of the world.
+        azimuth_deg: direction of view; 90 is the world's +y [degrees].
+        axes: whether the frames' axes are drawn (x red, y green, z blue).
+    """
+    origins = {name: np.array(data.body(RIG + name).xpos) for name in FRAMES}
+    points = np.array(list(origins.values()))
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat = points.mean(axis=0) - [0.0, 0.0, 0.12]  # the body of the pan-tilt unit is below the frames
+    camera.distance = max(CLOSEST, FILL * float(np.linalg.norm(np.ptp(points, axis=0))))
+    camera.azimuth, camera.elevation = azimuth_deg, ELEVATION_DEG
+    option = mujoco.MjvOption()
+    option.geomgroup[RIG_GROUP], option.geomgroup[FRAME_GROUP], option.geomgroup[BOARD_GROUP] = 1, axes, 0
+    option.sitegroup[:] = 0
+    before = float(model.vis.global_.fovy)
+    renderer = make_renderer(model, *PORTRAIT_SIZE)
+    try:
+        model.vis.global_.fovy = FIELD_DEG
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+        renderer.update_scene(data, camera, option)
+        image = np.ascontiguousarray(renderer.render()[..., ::-1])
+        pixels = {name: _project(renderer.scene, x) for name, x in origins.items()}
+    finally:
+        model.vis.global_.fovy = before
+        renderer.close()
+    return Portrait(image, pixels)
+
+
+def _project(scene: "mujoco.MjvScene", x_world: Array) -> Array:
+    """Project a point of the world into a free camera's render, (2,) [px]."""
+    left, right = scene.camera[0], scene.camera[1]  # MuJoCo keeps two for stereo; their mean is the view
+    forward, up = np.array(left.forward), np.array(left.up)
+    offset = x_world - (np.array(left.pos) + np.array(right.pos)) / 2
+    focal = PORTRAIT_SIZE[1] / 2 / np.tan(np.radians(FIELD_DEG) / 2)
+    across = np.array([offset @ np.cross(forward, up), -(offset @ up)])
+    return (np.array(PORTRAIT_SIZE) - 1) / 2 + focal * across / (offset @ forward)

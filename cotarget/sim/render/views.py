@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from cotarget.geometry import Array
 from cotarget.rig import Image
-from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP
+from cotarget.sim.model import BOARD_GROUP, RIG
 from cotarget.sim.render.opengl import Canvas, mujoco
 from cotarget.sim.render.optics import Pinhole, TrueLens, bend, covering_view
 from cotarget.sim.state import WorldState
@@ -117,7 +117,7 @@ class Views:
         self._corners = model.geom_aabb[:, None, :3] + corners * model.geom_aabb[:, None, 3:]
         self._endless = model.geom_rbound == 0  # planes
         self._groups = np.array(model.geom_group)
-        self._shown = ~np.isin(self._groups, (BOARD_GROUP, RIG_GROUP, FRAME_GROUP))
+        self._shown = self._groups < BOARD_GROUP
         self._blurs = self._shown & ~np.isin(np.arange(model.ngeom), state.faint)
 
     def apart(self) -> "Views":

@@ -14,7 +14,7 @@ from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array
 from cotarget.sim.targets.paths import MOUNT
 from cotarget.sim.targets.person import PERSON_HEIGHT
-from cotarget.sim.targets.target import draw_size, target_rng
+from cotarget.sim.targets.target import true_size
 
 SECONDS = 20.0  # of a run
 LONE, GROUPED = ("book", "person", "bird"), ("person", "bird")  # kinds with paths for one target, and for five
@@ -46,7 +46,7 @@ def lone_path(name: str, seed: int) -> dict[str, tuple[Waypoint, ...]]:
         raise ConfigError(f"unknown target '{name}'; the scenes to hold are: {choices(LONE)}")
     makers: dict[str, Callable[[np.random.Generator, float], list[Waypoint]]]
     makers = dict(zip(LONE, (_book, _person, _bird), strict=True))
-    size = draw_size(name, target_rng(seed, name), scatter=True)
+    size = true_size(name, seed)
     return {name: tuple(makers[name](_rng(seed, name), size))}
 
 
@@ -67,7 +67,7 @@ def group_paths(kind: str, seed: int) -> dict[str, tuple[Waypoint, ...]]:
         raise ConfigError(f"unknown kind '{kind}'; five at once there are of: {choices(GROUPED)}")
     makers = dict(zip(GROUPED, (_passing_persons, _passing_birds), strict=True))
     names = [kind, *(f"{kind}{i}" for i in range(2, GROUP + 1))]
-    sizes = [draw_size(name, target_rng(seed, name), scatter=True) for name in names]
+    sizes = [true_size(name, seed) for name in names]
     paths = makers[kind](_rng(seed, f"five {kind}"), sizes)
     return {name: tuple(path) for name, path in zip(names, paths, strict=True)}
 

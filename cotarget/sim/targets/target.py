@@ -10,20 +10,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cotarget.config import Waypoint, known_targets, split_name
 from cotarget.errors import ConfigError
-from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.geometry import Array, Rotation
 from cotarget.sim.targets import KINDS
 from cotarget.sim.targets.attitude import Axes, heading
 from cotarget.sim.targets.paths import Path, waypoint_path
-
-if TYPE_CHECKING:
-    import mujoco
-
 
 MARKERS_OF_A_KIND = 5  # textures of different markers, after which the ids repeat
 RANDOM = 3  # random stream of the targets, separate from the world's others
@@ -74,11 +69,6 @@ class TargetPose:
     rotation: Rotation
     joints: Mapping[str, float]
 
-    @property
-    def T_world_target(self) -> RigidTransform:
-        """Pose of the target's body."""
-        return RigidTransform.from_components(self.position, self.rotation)
-
 
 @dataclass(frozen=True)
 class Target:
@@ -107,21 +97,8 @@ class Target:
 
     def pose(self, t: float) -> TargetPose:
         """Give pose and joint angles at time ``t`` [s]."""
-        position, axes, joints = self.stance(t, self.beat(t))
+        position, axes, joints = self.kind.stance(self, t, self.kind.beat(self, t))
         return TargetPose(np.array(position), Rotation.from_matrix(np.transpose(axes), assume_valid=True), joints)
-
-    def stance(self, t: float, beat: float) -> Stance:
-        """Give pose and joint angles as floats, which is faster than `pose`.
-
-        Args:
-            t: the time [s].
-            beat: phase of the limb cycle at that time, from `beat` [rad].
-        """
-        return self.kind.stance(self, t, beat)
-
-    def beat(self, t: float) -> float:
-        """Give the phase of the limb cycle at time ``t`` [s], which may grow without limit [rad]."""
-        return self.kind.beat(self, t)
 
 
 def own_kind(name: str, model: FilePath) -> TargetKind:
@@ -153,17 +130,15 @@ def make_target(
         own: file of a user's own model, which needs waypoints.
 
     Raises:
-        ConfigError: an unknown target, no waypoints where the kind has no path, or waypoints whose times do not
-            increase.
+        ConfigError: an unknown target.
     """
     kind = kind_of(name) if own is None else own_kind(split_name(name)[0], own)
     # Drawn also where it is not used, so that no switch changes the path.
-    size = _draw_size(kind, rng, scatter)
+    size = _draw_size(kind, rng, scatter)  # the generator's first number
     phase = float(rng.uniform(0.0, 2 * np.pi))
     if waypoints is not None:
-        return Target(name, kind, size, waypoint_path(waypoints, f"sim.paths.{name}"), phase)
-    if kind.path is None:
-        raise ConfigError(f"sim.targets: a {name} of your own needs a path: [sim.paths] {name}")
+        return Target(name, kind, size, waypoint_path(waypoints), phase)
+    assert kind.path is not None  # a configuration is refused whose own targets have no waypoints
     return Target(name, kind, size, kind.path(scene, rng), phase, own_way=True)
 
 
@@ -172,9 +147,9 @@ def target_rng(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng((seed, RANDOM, zlib.crc32(name.encode())))
 
 
-def draw_size(name: str, rng: np.random.Generator, scatter: bool) -> float:
-    """Draw a target's true size over its nominal size; it is the first number from its generator."""
-    return _draw_size(kind_of(name), rng, scatter)
+def true_size(name: str, seed: int) -> float:
+    """Give the true size over the nominal size that a world of that seed gives a target."""
+    return _draw_size(kind_of(name), target_rng(seed, name), scatter=True)
 
 
 def _draw_size(kind: TargetKind, rng: np.random.Generator, scatter: bool) -> float:
@@ -202,28 +177,5 @@ def marker_of(name: str) -> int | None:
         ConfigError: an unknown target.
     """
     kind = kind_of(name)
-    return None if kind.marker is None else kind.marker + kind.marker_step * _index(name)
-
-
-def _index(name: str) -> int:
-    """Give a target's index among the markers of its kind."""
-    return (split_name(name)[1] - 1) % MARKERS_OF_A_KIND
-
-
-def change_marker(spec: "mujoco.MjSpec", name: str) -> None:
-    """Set the marker of that name on a target's model; do it before attaching."""
-    kind = kind_of(name)
-    if kind.marker_step and _index(name):
-        spec.texture(f"{kind.name}_marker").file = f"{kind.name}_marker_{marker_of(name)}.png"
-
-
-def scale_spec(spec: "mujoco.MjSpec", factor: float) -> None:
-    """Scale all lengths of a target's model by ``factor``; do it before attaching."""
-    for mesh in spec.meshes:
-        mesh.scale = np.asarray(mesh.scale) * factor
-    for geom in spec.geoms:
-        geom.size = np.asarray(geom.size) * factor
-        geom.pos = np.asarray(geom.pos) * factor
-        geom.fromto = np.asarray(geom.fromto) * factor  # nan where the geom has none
-    for element in [*spec.bodies[1:], *spec.sites, *spec.joints]:
-        element.pos = np.asarray(element.pos) * factor
+    index = (split_name(name)[1] - 1) % MARKERS_OF_A_KIND
+    return None if kind.marker is None else kind.marker + kind.marker_step * index

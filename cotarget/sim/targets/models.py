@@ -1,18 +1,57 @@
-"""Models of a user's own targets, from a mesh or an MJCF file with one body."""
+"""MuJoCo models of the targets: those of the kinds, and a user's own from a mesh or an MJCF file with one body."""
 
 from pathlib import Path
 
 import numpy as np
 
 from cotarget.errors import ConfigError, choices
+from cotarget.files import assets_dir
 from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.targets.target import Target, marker_of
 
 GREY = (0.55, 0.55, 0.55, 1.0)  # colour of a mesh without a texture
 LARGEST_M = 200.0  # of a target's part; a larger one is a model in millimetres
 SHAPES = ("box", "capsule", "cylinder", "ellipsoid", "mesh", "sphere")  # geom types with a known outline
 
 
-def own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
+def kind_model(kind: str) -> "mujoco.MjSpec":
+    """Read the model of a kind of target, in its nominal size and with the marker of the first of its kind."""
+    return mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{kind}.xml"))
+
+
+def target_model(target: Target, hidden: int) -> "mujoco.MjSpec":
+    """Read a target's model, in its true size and with its own marker.
+
+    Args:
+        target: the target.
+        hidden: first group of geoms that are not drawn; a user's model keeps collision geoms there.
+
+    Raises:
+        ConfigError: a user's file is no target's model.
+    """
+    kind = target.kind
+    if kind.own is not None:
+        return _own_model(kind.own, kind.name, hidden)
+    spec = kind_model(kind.name)
+    scale_spec(spec, target.size)
+    if (marker := marker_of(target.name)) != kind.marker:
+        spec.texture(f"{kind.name}_marker").file = f"{kind.name}_marker_{marker}.png"
+    return spec
+
+
+def scale_spec(spec: "mujoco.MjSpec", factor: float) -> None:
+    """Scale all lengths of a target's model by ``factor``."""
+    for mesh in spec.meshes:
+        mesh.scale = np.asarray(mesh.scale) * factor
+    for geom in spec.geoms:
+        geom.size = np.asarray(geom.size) * factor
+        geom.pos = np.asarray(geom.pos) * factor
+        geom.fromto = np.asarray(geom.fromto) * factor  # nan where the geom has none
+    for element in [*spec.bodies[1:], *spec.sites, *spec.joints]:
+        element.pos = np.asarray(element.pos) * factor
+
+
+def _own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
     """Read a user's target model: lengths in metres, x forward, y left, z up, origin on the path.
 
     The target is rigid. Only bodies and the geoms that are drawn are used.
@@ -21,7 +60,7 @@ def own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
         path: a mesh (.obj, .stl) with an optional texture, the .png of the same name beside it; or an MJCF file (.xml)
             with one body in its worldbody.
         kind: the target's name without a number, which becomes the name of the body.
-        hidden: first group of geoms that are not drawn; models keep collision geoms there.
+        hidden: first group of geoms that are not drawn.
 
     Raises:
         ConfigError: the file cannot be read, or is not such a model, or is in millimetres.
