@@ -426,37 +426,20 @@ class WebDevice:
 
 
 def _authentication(user: str, password: str) -> "httpx.Auth":
-    """Make the authentication by the scheme that the device demands, digest before basic; each is tried once."""
+    """Make the authentication by the scheme that the device demands, digest before basic."""
     import httpx
 
     class DemandedAuth(httpx.Auth):
-        def __init__(self) -> None:
-            self._schemes = {"digest": httpx.DigestAuth(user, password), "basic": httpx.BasicAuth(user, password)}
-            self._auth = httpx.Auth()  # sends the request as it is
-
         def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
-            response = yield from _last_response(self._auth.auth_flow(request))
+            response = yield request
             lines = response.headers.get_list("www-authenticate") if response.status_code == 401 else []
             demanded = {line.split(" ")[0].lower() for line in lines}
-            auth = next((auth for scheme, auth in self._schemes.items() if scheme in demanded), self._auth)
-            if auth is not self._auth:
-                self._auth = auth
-                yield from auth.auth_flow(request)
+            if "digest" in demanded:
+                yield from httpx.DigestAuth(user, password).auth_flow(request)
+            elif "basic" in demanded:
+                yield from httpx.BasicAuth(user, password).auth_flow(request)
 
     return DemandedAuth()
-
-
-def _last_response(
-    flow: "Generator[httpx.Request, httpx.Response, None]",
-) -> "Generator[httpx.Request, httpx.Response, httpx.Response]":
-    """Send the requests of a flow, and return the last one's response."""
-    request = next(flow)
-    while True:
-        response = yield request
-        try:
-            request = flow.send(response)
-        except StopIteration:
-            return response
 
 
 def _import_httpx() -> ModuleType:

@@ -426,21 +426,16 @@ class StillJob:
             self._future = future
             self._patience.reset()
         try:
-            frame = self._take()
+            self._finish(future, self._take())
         except LinkError as error:
-            try:
-                due = self._patience.next_try(error)
-            except LinkError:
+            if error.code in LOST:
                 self._finish(future, DeviceError(f"the zoom camera was lost while it took a still: {error}"))
-                raise
-            if due is None:
+            if (due := self._patience.next_try(error)) is None:
                 self._finish(future, DeviceError(f"the zoom camera takes no still: {error}"))
             else:
                 self._due = due
         except (ConfigError, DeviceError) as error:
             self._finish(future, error)
-        else:
-            self._finish(future, frame)
 
     def _take(self) -> Frame:
         begin = self._clock.now()

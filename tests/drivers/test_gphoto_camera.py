@@ -324,17 +324,6 @@ def test_padding_and_the_orientation_change_nothing(data):
     assert np.abs(bench.newest().image - 50.0).max() <= GREY
 
 
-def test_a_viewfinder_whose_frames_all_have_bytes_too_many_is_taken_as_it_is():
-    def prepare(camera):
-        exact = camera.preview
-        camera.preview = lambda: exact()[:-2] + bytes(651) + b"\xff\xd9"
-
-    bench = Bench(prepare=prepare)
-    bench.run(0.5)
-    assert len(bench.frames) > 1
-    assert bench.buffer.counts.refused == 0
-
-
 # The lens
 
 

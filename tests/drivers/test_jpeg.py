@@ -166,13 +166,6 @@ def test_pictures_without_huffman_tables_have_the_usual_ones():
     np.testing.assert_array_equal(decode_jpeg(bare), opencv(jpeg))
 
 
-def test_large_stills():
-    jpeg = picture((3264, 2448), 0)
-    assert decode_jpeg(jpeg).shape == (2448, 3264, 3)
-    first, long = scan(jpeg), len(jpeg) // 4
-    assert not accepted(jpeg[: first + long] + bytes(long) + jpeg[first + 2 * long :])
-
-
 def test_a_header_that_asks_for_gigabytes_is_refused():
     jpeg = picture((64, 48), 0)
     at = jpeg.index(b"\xff\xc0") + 5

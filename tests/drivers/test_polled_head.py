@@ -1,6 +1,7 @@
 """`PolledHead` on a unit of another protocol than the D46's: both axes report at once, and a move is one message."""
 
 import math
+import threading
 
 import pytest
 
@@ -163,6 +164,39 @@ def test_a_head_that_does_not_arrive_is_not_opened_again(opened, link):
     head.close()
     with pytest.raises(DeviceError, match="cotarget reset-head"):
         opened()
+
+
+def silent(*_):
+    raise SilentError("it is silent")
+
+
+def test_a_halt_of_a_dead_unit_is_sent_all_the_same_and_told(opened, link):
+    head = opened()
+    link.polls_fail, link.halt_last = [SilentError("it is silent"), ...], silent
+    for call in (lambda: ask_again_and_again(head), head.halt):
+        with pytest.raises(DeviceError, match="silent"):
+            call()
+    assert link.sent == ["halt without an answer"]
+
+
+def test_a_link_that_hangs_holds_up_neither_a_halt_nor_the_end(opened, link, monkeypatch, caplog):
+    for limit in ("HALT_S", "CLOSE_S"):
+        monkeypatch.setattr(f"cotarget.drivers.polled_head.{limit}", 0.01)
+    hangs, release = threading.Event(), threading.Event()
+
+    def poll():
+        hangs.set()
+        release.wait(20.0)
+        return CounterLink.poll(link)
+
+    head = opened()
+    link.poll = poll
+    assert hangs.wait(20.0)
+    with pytest.raises(DeviceError, match="COUNTER did not acknowledge a halt"):
+        head.halt()
+    head.close()
+    assert "does not end" in caplog.text
+    release.set()
 
 
 def test_a_mistake_in_the_last_halt_forgets_no_lost_position(opened, link):

@@ -422,7 +422,11 @@ def test_a_halt_does_not_wait_for_a_silent_unit(bench):
 
 
 @pytest.mark.parametrize(
-    "reply", [b"* 1", b"", b"*\r\n", b"\xf3\x10\x80", b"* 7 7\r\n", b"PP * 7\r\n", b"! Illegal\r\n"]
+    "reply",
+    [
+        *(b"* 1", b"", b"*\r\n", b"\xf3\x10\x80", b"* 7 7\r\n", b"PP * 7\r\n", b"! Illegal\r\n"),
+        *(b"\n" * 70, b"7" * 5000),  # too many lines, and one too long
+    ],
 )
 def test_one_bad_answer_is_asked_for_again(bench, reply):
     bench.start()
@@ -488,6 +492,11 @@ ENDS = {
     "unplugged, says pyserial": (unplugged(serial.SerialException("device reports readiness")), LostError, "PORT"),
     "switched off and on": (power_cycled, PositionLostError, "cotarget reset-head"),
     "starts up": (lambda bench: bench.port.inject(BANNER), PositionLostError, "switched off and on"),
+    "!P in two halves": (
+        lambda bench: (bench.port.inject(b"!"), bench.port.inject(b"P", after=0.3)),
+        PositionLostError,
+        "pan hit its limit",
+    ),
     "does not arrive": (stuck, PositionLostError, r"pan \d+, tilt 0 steps, where 3000, 0"),
     **{
         f"!{axis} {how}": (act, PositionLostError, EVENTS[axis])
