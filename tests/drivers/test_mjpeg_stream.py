@@ -241,7 +241,7 @@ CRUMBS += [b"--myboundary", b"\r\nContent-Type: image/jpeg\r\n\r\n", b"\xff\xda\
 BOUNDARIES = st.sampled_from(["myboundary", "other", None])
 
 
-@settings(PROPERTY, max_examples=2000)
+@settings(PROPERTY, max_examples=800)
 @given(st.lists(st.sampled_from(CRUMBS) | st.binary(max_size=9), max_size=8), CUTS, BOUNDARIES)
 def test_how_a_stream_is_cut_into_pieces_does_not_matter(crumbs, cuts, boundary):
     stream = b"".join(crumbs)

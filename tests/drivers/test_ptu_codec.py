@@ -213,7 +213,7 @@ def mutated(draw):
     return bytes(line)
 
 
-@settings(PROPERTY, max_examples=3000)
+@settings(PROPERTY, max_examples=1000)
 @given(mutated())
 def test_whatever_comes_is_understood_or_refused_and_an_integer_alone_is_what_the_bytes_spell(line):
     assert set(ptu_protocol.split_events(line)[1]) <= {"P", "T", "D"}

@@ -16,6 +16,7 @@ from cotarget.drivers.axis import AxisCamera, AxisSettings
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.gphoto_camera import GphotoCamera, GphotoSettings
 from cotarget.drivers.ptu_d46 import D46Head
+from cotarget.errors import DeviceError
 from cotarget.recording.recorder import Recorder
 from cotarget.recording.replay import Replay
 from cotarget.safety.safe_rig import guard
@@ -45,12 +46,14 @@ class Way:
 
 
 def way(name, opened, *marks):
-    """A way by a context manager that gives a device and its clock."""
+    """A way by a context manager that gives a device of a driver and its clock, and closes it."""
 
     def keep(promise, folder):
         with opened() as (device, clock):
             promise(device, clock)
         device.close()  # may be called again
+        with pytest.raises(DeviceError):
+            device.state() if hasattr(device, "state") else device.read()
 
     return Way(name, keep, marks)
 
