@@ -1,12 +1,10 @@
 """Emulated devices with little behind them, one at a time: a feed of pictures, axes in real time, a lens."""
 
 import contextlib
-import itertools
 import os
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import cv2
@@ -15,11 +13,9 @@ import pytest
 
 from cotarget.drivers.ptu_d46 import D46Settings
 from cotarget.emulators.axis_241q import AxisServer
-from cotarget.emulators.plant import Feed, Picture
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
-from tests.support.plants import DEADLINE_S, LiveUnit
+from tests.support.plants import DEADLINE_S, Film, LiveUnit
 
-FEED_S = 0.04  # between the pictures of the emulated video server
 FEED_SIZE = (320, 240)
 USER, PASSWORD = "root", "hunter2 & co"
 
@@ -33,29 +29,18 @@ def axis_server():
 
     Its ``sent`` has the time at which each picture was sent.
     """
-    feed, sent, end = Feed(), {}, threading.Event()
-    rng = np.random.default_rng(0)
+    sent, rng = {}, np.random.default_rng(0)
     scene = cv2.resize(rng.integers(0, 255, (15, 20, 3), dtype=np.uint8), FEED_SIZE, interpolation=cv2.INTER_CUBIC)
 
-    def publish():
-        for index in itertools.count():
-            image = cv2.add(scene, rng.integers(0, 5, scene.shape, dtype=np.uint8))
-            for bit in range(16):
-                image[:16, 16 * bit : 16 * bit + 16] = 255 * (index >> bit & 1)
-            feed.publish(Picture(image, index, time.monotonic()))
-            if end.wait(FEED_S):
-                return
+    def draw(index):
+        image = cv2.add(scene, rng.integers(0, 5, scene.shape, dtype=np.uint8))
+        for bit in range(16):
+            image[:16, 16 * bit : 16 * bit + 16] = 255 * (index >> bit & 1)
+        return image
 
-    publisher = threading.Thread(target=publish, daemon=True)
-    publisher.start()
-    try:
-        with AxisServer({1: feed}, user=USER, password=PASSWORD, sent=sent.__setitem__) as server:
-            server.sent = sent
-            yield server
-    finally:
-        end.set()
-        publisher.join(DEADLINE_S)
-        assert not publisher.is_alive()
+    with Film(draw) as film, AxisServer({1: film.feed}, user=USER, password=PASSWORD, sent=sent.__setitem__) as server:
+        server.sent = sent
+        yield server
 
 
 def picture_number(image):
@@ -88,38 +73,22 @@ class D46Unit(LiveUnit):
 # The Canon PowerShot S5 IS: in a process of its own, because libgphoto2 would hold up its threads
 
 S5IS = """
-import sys, threading, time
-import numpy as np
-from cotarget.emulators.faults import Faults
-from cotarget.emulators.plant import Feed, Picture
+import sys
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
+from cotarget.emulators.faults import Faults
+from tests.support.plants import Film, LensModel, plain
 
-class Lens:
-    last, at = 128, 0
-    def command(self, position):
-        self.at = position
-    def position(self):
-        return self.at
-    def moving(self):
-        return False
-
-def show(feed, done):
-    index = 0
-    while not done.wait(0.05):
-        index += 1
-        feed.publish(Picture(np.full((480, 640, 3), 20 + index % 200, np.uint8), index, time.monotonic()))
-
-feed, lens, faults, done = Feed(), Lens(), Faults(S5IS_FAULTS), threading.Event()
-still = np.full((2448, 3264, 3), 90, np.uint8)
-threading.Thread(target=show, args=(feed, done), daemon=True).start()
-with S5isServer(feed, lambda: still, lens, faults=faults) as server:
+still, lens, faults = plain((3264, 2448), 90), LensModel(), Faults(S5IS_FAULTS)
+with (
+    Film(lambda index: plain((640, 480), 20 + index % 200), 0.05) as film,
+    S5isServer(film.feed, lambda: still, lens, faults=faults) as server,
+):
     print(server.port, flush=True)
     for line in sys.stdin:
         if line.strip():
             name, on = line.split()
             faults.set(name, on == "on")
-        print(lens.at, flush=True)
-done.set()
+        print(lens.position(), flush=True)
 """
 
 
