@@ -34,6 +34,7 @@ PASSWORD_VARIABLE = "COTARGET_PASSWORD"
 PARAMETER_PATHS = ("/axis-cgi/param.cgi", "/axis-cgi/view/param.cgi")
 STATUS_PATH = "/axis-cgi/videostatus.cgi"
 STREAM_PATH = "/axis-cgi/mjpg/video.cgi"
+AXIS = "AXIS"  # the brand that an Axis reports
 # A stream has stalled after this time without a byte [s], or after this many frame periods where that is longer.
 SILENCE_S, SILENCE_PICTURES = 2.0, 3.0
 
@@ -86,25 +87,6 @@ class LoginError(StreamRefusedError):
 
 
 @dataclass(frozen=True)
-class Identity:
-    """What a video server reports about itself; what it does not report is empty or None.
-
-    Attributes:
-        brand: maker.
-        product: product number, such as "241Q".
-        firmware: version of the firmware.
-        api: version of the HTTP interface.
-        inputs: number of camera inputs.
-    """
-
-    brand: str
-    product: str
-    firmware: str
-    api: str
-    inputs: int | None
-
-
-@dataclass(frozen=True)
 class Stream:
     """An open stream: the boundary that its header announces, and its bytes as they arrive."""
 
@@ -136,11 +118,8 @@ class VideoServer:
         self.silence_s = max(SILENCE_S, SILENCE_PICTURES / config.rate_hz)
         self.web = WebDevice(self.name, self._user, self._password, self.silence_s)
 
-    def identify(self) -> Identity | None:
-        """Ask the server for its brand, product, firmware and inputs.
-
-        Returns:
-            None where the server lists no parameters, or not for this user.
+    def identify(self) -> dict[str, str]:
+        """List the server's parameters of brand, properties and inputs; {} where it lists none, or not for this user.
 
         Raises:
             DeviceError: the server cannot be reached.
@@ -148,19 +127,12 @@ class VideoServer:
         for path in PARAMETER_PATHS:
             listed = self._parameters(path, "root.Brand")
             if listed is None:
-                return None  # repeated wrong passwords may lock the user out
+                break  # repeated wrong passwords may lock the user out
             if listed:
                 for group in ("root.Properties", "root.ImageSource"):
                     listed |= self._parameters(path, group) or {}
-                inputs = listed.get("ImageSource.NbrOfSources", "")
-                return Identity(
-                    brand=listed.get("Brand.Brand", ""),
-                    product=listed.get("Brand.ProdNbr", ""),
-                    firmware=listed.get("Properties.Firmware.Version", ""),
-                    api=listed.get("Properties.API.HTTP.Version", ""),
-                    inputs=int(inputs) if re.fullmatch("[0-9]{1,4}", inputs) else None,
-                )
-        return None
+                return listed
+        return {}
 
     def has_video(self) -> bool | None:
         """Ask whether a camera is connected to the input; None where the server does not say.
@@ -173,38 +145,38 @@ class VideoServer:
         match = re.search(rf"^\s*Video\s+{camera}\s*=\s*(no\s+)?video\b", text, re.IGNORECASE | re.MULTILINE)
         return None if match is None else match[1] is None
 
-    def check(self) -> str:
-        """Refuse a server that reports itself as the wrong one; return the version of its HTTP interface, or "".
+    def check(self) -> dict[str, str]:
+        """Refuse a server that reports itself as the wrong one; return its parameters as `identify` does.
 
         Raises:
             DeviceError: the server cannot be reached, is no Axis, has no such input, or has no video there.
         """
-        identity, camera = self.identify(), self._config.camera
-        if identity is not None:
-            if identity.brand and identity.brand.upper() != "AXIS":
-                raise DeviceError(f"{self.name} is a '{identity.brand}', no Axis: check hardware.fixed.url")
-            if identity.inputs is not None and camera > identity.inputs:
-                valid = f"1 to {identity.inputs}" if identity.inputs > 1 else "1"
-                raise DeviceError(f"{self.name} has no camera {camera}: set hardware.fixed.camera to {valid}")
+        listed, camera = self.identify(), self._config.camera
+        brand, inputs = listed.get("Brand.Brand") or AXIS, listed.get("ImageSource.NbrOfSources", "")
+        if brand.upper() != AXIS:
+            raise DeviceError(f"{self.name} is a '{brand}', no Axis: check hardware.fixed.url")
+        if re.fullmatch("[0-9]{1,4}", inputs) and camera > int(inputs):
+            valid = f"1 to {inputs}" if int(inputs) > 1 else "1"
+            raise DeviceError(f"{self.name} has no camera {camera}: set hardware.fixed.camera to {valid}")
         if self.has_video() is False:
             check = "check its cable, or hardware.fixed.camera"
             raise DeviceError(f"{self.name} has no video on input {camera}: {check}")
-        return "" if identity is None else identity.api
+        return listed
 
     def describe(self) -> str:
         """Describe the server in one line.
 
         Raises:
             StreamRefusedError: the server reports nothing about itself and has no stream either; the message says why.
-            DeviceError: the server cannot be reached.
+            DeviceError: as `check`.
         """
-        identity, video = self.identify(), self.has_video()
-        if identity is None and video is None:
+        listed, video = self.check(), self.has_video()
+        if not listed and video is None:
             with self.stream():
                 return "does not say what it is, but sends pictures"
-        parts = [] if identity is None else [f"{identity.brand} {identity.product}".strip()]
-        if identity is not None and identity.firmware:
-            parts.append(f"firmware {identity.firmware}")
+        parts = [f"{listed.get('Brand.Brand', '')} {listed.get('Brand.ProdNbr', '')}".strip()] if listed else []
+        if firmware := listed.get("Properties.Firmware.Version"):
+            parts.append(f"firmware {firmware}")
         if video:
             parts.append(f"input {self._config.camera} has video")
         return ", ".join(parts)
@@ -214,7 +186,7 @@ class VideoServer:
         """Open the image stream for the length of a with block.
 
         Args:
-            api: version of the HTTP interface, from `identify`.
+            api: version of the HTTP interface, where the server reports it.
 
         Raises:
             BusyError: the server has no place for another viewer now.
@@ -486,7 +458,6 @@ class AxisCamera:
         """
         server = VideoServer(settings)
         with contextlib.closing(server.web):
-            server.check()
             return server.describe()
 
     def __init__(self, config: AxisSettings, clock: Clock) -> None:
@@ -499,7 +470,7 @@ class AxisCamera:
         self._frames = FrameBuffer(name, clock, config.size, config.latency_s, self._server.silence_s)
         import_simplejpeg()
         try:
-            self._api = self._server.check()
+            self._api = self._server.check().get("Properties.API.HTTP.Version", "")
             self._frames.start(lambda: self._frames.keep_open(self._stream, self._ask_for_video), "axis")
             width, height = self._frames.first(OPEN_S)
             if (width, height) != config.size:
