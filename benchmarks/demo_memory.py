@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from experiments.engine.texts import table
+from experiments.tables import columns
 
 EVERY_S = 0.1
 WANTED_MB = 600.0
@@ -78,7 +78,7 @@ def main() -> int:
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         resident, at_peak, when = watch(process)
         took = time.monotonic() - began
-        print(table(COLUMNS, [[round(a), b, c] for a, b, c in at_peak]))
+        print(columns(COLUMNS, [[round(a), b, c] for a, b, c in at_peak]))
         proportional = sum(pss for *_, pss in at_peak)
         print(
             f"peak {proportional:.0f} MB after {when:.0f} of {took:.0f} s; summed resident memory {resident:.0f} MB; "

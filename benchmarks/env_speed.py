@@ -8,28 +8,24 @@ from the pipeline, because a target in the close-up is the most expensive case.
 
 Steps without pictures run on one thread and are timed by processor time; those with pictures are timed by the clock.
 The time of a reset, which builds a world, is reported too.
-
-    python -m benchmarks.env_speed [--seeds 1] [--seed-base 0] [--quick] [--out DIR]
 """
 
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from annotated_types import Ge, Gt, Le
 
 from benchmarks.plain_renderer import PlainRenderer
-from cotarget.config import RigConfig
 from cotarget.env import Follow, PipelinePolicy
 from cotarget.env.common import Vector
 from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.world import SimWorld
-from experiments.engine.checks import check_above, check_least, check_ways
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import table
+from experiments.engine import Count, Row, Settings
+from experiments.tables import grouped
 
 SIZE = (64, 64)
 BLOCK = 25  # steps of each in turn; with single steps each would find the caches as the other left them
@@ -47,17 +43,10 @@ class EnvSpeedSettings(Settings):
         seconds_seen: length of an episode with pictures [s].
     """
 
-    seeds: int = 1
+    seeds: Count = 1
     targets: tuple[str, ...] = ("book", "person", "bird")
-    seconds: float = 20.0
-    seconds_seen: float = 6.0
-
-    def __post_init__(self) -> None:
-        """Refuse values that the environments refuse, and runs too short to time."""
-        super().__post_init__()
-        check_least(BLOCK / RigConfig().sim.fixed.rate_hz, self, "seconds")
-        check_above(0, self, "seconds_seen")
-        check_ways(self, "seconds", "seconds_seen")
+    seconds: Annotated[float, Ge(1.0), Le(SECONDS)] = 20.0  # a block and more
+    seconds_seen: Annotated[float, Gt(0), Le(SECONDS)] = 6.0
 
 
 class Alone:
@@ -86,8 +75,8 @@ class Alone:
             mujoco.mj_step(model, data)
 
 
-def one(shared: None, settings: EnvSpeedSettings, seed: int) -> list[Row]:
-    """Time all cases once."""
+def one(settings: EnvSpeedSettings, seed: int) -> list[Row]:
+    """Time all cases once; give a row per block or step."""
     return [row for name in settings.targets for row in (*tracks(settings, name, seed), *images(settings, name, seed))]
 
 
@@ -160,8 +149,7 @@ def timed(clock: Callable[[], float], step: Callable[[int], object], block: Sequ
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Give medians by kind of observation and target, and the speed over MuJoCo's."""
     found = {}
-    for what, name in dict.fromkeys((row["what"], row["target"]) for row in rows):
-        own = [row for row in rows if (row["what"], row["target"]) == (what, name)]
+    for (what, name), own in grouped(rows, "what", "target").items():
         env_us, alone_us = (float(np.median([row[key] for row in own])) for key in ("env_us", "alone_us"))
         found[f"{what}, {name}"] = {
             "steps_per_s": 1e6 / env_us,
@@ -177,37 +165,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     return [name for name, found in summary.items() if not found["ratio"] >= WANTED[name.split(",")[0]]]
 
 
-def describe(settings: EnvSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per kind of observation and target."""
-    head = ("cotarget/Follow-v0", "steps/s", "MuJoCo alone", "ratio", "reset [ms]", "wanted")
-    lines = [[name, *found.values(), f">= {WANTED[name.split(',')[0]]:g}"] for name, found in summary.items()]
-    return f"steps a second beside MuJoCo alone, {seeds_of(settings)}; medians\n" + table(head, lines)
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Steps a second, each pair of bars an environment and MuJoCo alone."""
-    found = summarise(rows)
-    at, ax = np.arange(len(found)), figure.subplots()
-    ax.bar(at - 0.2, [each["steps_per_s"] for each in found.values()], 0.4, label="environment")
-    ax.bar(at + 0.2, [each["alone_per_s"] for each in found.values()], 0.4, label="MuJoCo alone")
-    ax.set(ylabel="steps a second", yscale="log", xticks=at, xticklabels=list(found))
-    ax.tick_params(axis="x", rotation=20)
-    ax.legend(frameon=False)
-
-
 SETTINGS = EnvSpeedSettings()
-EXPERIMENT = Experiment(
-    "env_speed",
-    "The environments' speed, beside MuJoCo alone.",
-    SETTINGS,
-    replace(SETTINGS, seeds=1, targets=("bird",), seconds=4.0, seconds_seen=0.4),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    alone=True,
-    cost_s=60.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=1, targets=("bird",), seconds=4.0, seconds_seen=0.4)
+ALONE = True
+COST_S = 60.0

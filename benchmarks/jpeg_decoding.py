@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from cotarget.drivers.mjpeg import DamagedError, decode_jpeg
-from experiments.engine.texts import table
+from experiments.tables import columns
 
 PICTURES, ROUNDS = 60, 5
 SIZES = ((320, 240), (640, 480))
@@ -124,7 +124,7 @@ def main() -> None:
         rng = np.random.default_rng(7)
         pictures = [damage(picture(SIZES[-1], seed), rng) for seed in range(PICTURES)]
         lines.append([name, *(sum(map(way, pictures)) for way in ways.values())])
-    print(f"accepted of {PICTURES} pictures\n" + table(("damage", *ways), lines))
+    print(f"accepted of {PICTURES} pictures\n" + columns(("damage", *ways), lines))
     speeds: dict[str, Callable[[bytes], object]] = {
         "cv2.imdecode": _opencv,
         "decode_jpeg": _strict,
@@ -136,7 +136,7 @@ def main() -> None:
         taken = {name: min(_milliseconds(way, pictures) for _ in range(ROUNDS)) for name, way in speeds.items()}
         for name, ms in taken.items():
             lines.append([f"{size[0]}x{size[1]}: {name}", ms, ms / taken["cv2.imdecode"]])
-    print("\n" + table(("way", "ms a picture", "over cv2.imdecode"), lines))
+    print("\n" + columns(("way", "ms a picture", "over cv2.imdecode"), lines))
 
 
 if __name__ == "__main__":

@@ -5,12 +5,9 @@ The film shows a real bird (V_BIRD_036 of Svanstroem et al., doi 10.5281/zenodo.
 timed: `cv2.createBackgroundSubtractorMOG2().apply` alone on BGR, and the loop's work on a fixed-camera frame: detect,
 track in the image and in 3D, and aim exactly at the target's predicted position. Control of head and lens and the zoom
 view are left out. OpenCV uses its default number of threads.
-
-    python -m benchmarks.pipeline_speed [--seeds 1: times through the film] [--quick] [--out DIR]
 """
 
 import math
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +16,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 
 from cotarget import backends
 from cotarget.calibration import Calibration
@@ -36,11 +32,10 @@ from cotarget.targeting import Reach, aim
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film
-from experiments.engine.harness import Experiment, Row, Settings
-from experiments.engine.texts import table
+from experiments.engine import Count, Row, Settings
 
 FILM = Path(__file__).resolve().parents[2] / "shared" / "data" / "birds" / "V_BIRD_036.mp4"
-ALONE = "MOG2 alone"
+MIXTURE = "MOG2 alone"
 # Lead of the aim [s].
 LEAD_S = 0.1
 STAGES = ("detect_ms", "track_ms", "aim_ms")
@@ -54,13 +49,12 @@ class PipelineSpeedSettings(Settings):
     The first frames are not timed, because a learning model costs more or less.
     """
 
-    seeds: int = 1
-    frames: int = 300
-    untimed: int = 60
+    seeds: Count = 1
+    frames: Count = 300
+    untimed: Count = 60
 
     def __post_init__(self) -> None:
         """Refuse runs without timed frames."""
-        super().__post_init__()
         if self.untimed >= self.frames:
             raise ConfigError(f"untimed: {self.untimed} is not below frames = {self.frames}, so that none is timed")
 
@@ -122,7 +116,7 @@ def needs(settings: PipelineSpeedSettings) -> str:
     return f"needs {settings.frames} frames, and {FILM} has {there}" if few else ""
 
 
-def one(_: None, settings: PipelineSpeedSettings, seed: int) -> list[Row]:
+def one(settings: PipelineSpeedSettings, seed: int) -> list[Row]:
     """Run through the film once; give a row per frame and way."""
     rows: list[Row] = []
     with Film(FILM) as film:
@@ -133,7 +127,7 @@ def one(_: None, settings: PipelineSpeedSettings, seed: int) -> list[Row]:
             subtractor.apply(frame.image)
             return {"ms": 1e3 * (time.perf_counter() - began), "aimed": True}
 
-        ways: list[tuple[str, Callable[[Frame], Row]]] = [(ALONE, alone)]
+        ways: list[tuple[str, Callable[[Frame], Row]]] = [(MIXTURE, alone)]
         ways += [(kind, Pipeline(kind, film)) for kind in ("mog2", "motion", "speck")]
         for index, frame in enumerate(film):
             if index >= settings.frames:
@@ -149,13 +143,13 @@ def one(_: None, settings: PipelineSpeedSettings, seed: int) -> list[Row]:
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Give median milliseconds of the frames with a target to aim at, and the ratio to the subtraction."""
     found = {}
-    alone = float(np.median([row["ms"] for row in rows if row["way"] == ALONE]))
-    for way in dict.fromkeys(sorted((row["way"] for row in rows), key=lambda way: way != ALONE)):
+    alone = float(np.median([row["ms"] for row in rows if row["way"] == MIXTURE]))
+    for way in dict.fromkeys(sorted((row["way"] for row in rows), key=lambda way: way != MIXTURE)):
         mine = [row for row in rows if row["way"] == way]
         aimed = [row for row in mine if row["aimed"]]
         found[way] = {"frames_aimed": len(aimed) / len(mine)}
         for name in ("ms", *STAGES):
-            found[way][name] = float(np.median([row.get(name, np.nan) for row in aimed] or [np.nan]))
+            found[way][name] = float(np.median([row[name] for row in aimed if row.get(name) is not None] or [np.nan]))
         found[way]["ratio"] = found[way]["ms"] / alone
     return found
 
@@ -165,38 +159,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     return [way for way, most in WANTED.items() if not summary[way]["ratio"] <= most]
 
 
-def describe(settings: PipelineSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as a table."""
-    return f"{FILM.name}, {settings.frames - settings.untimed} frames, {settings.seeds} times; medians\n" + table(
-        ("way", "frames aimed", "ms a frame", "detect", "track", "aim", "of MOG2 alone", "wanted"),
-        ([way, *found.values(), f"<= {WANTED[way]:g}" if way in WANTED else ""] for way, found in summary.items()),
-    )
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Milliseconds of each frame."""
-    ax = figure.subplots()
-    for way in dict.fromkeys(row["way"] for row in rows):
-        ms = np.sort([row["ms"] for row in rows if row["way"] == way])
-        ax.plot(ms, np.linspace(0, 1, len(ms)), label=way)
-    ax.set(xlabel="milliseconds a frame", ylabel="part of the frames that take less", xscale="log")
-    ax.legend(frameon=False)
-
-
 SETTINGS = PipelineSpeedSettings()
-EXPERIMENT = Experiment(
-    "pipeline_speed",
-    "Milliseconds of detect, track and aim for a frame, beside MOG2 alone.",
-    SETTINGS,
-    replace(SETTINGS, seeds=1, frames=120),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    alone=True,
-    cost_s=60.0,
-    needs=needs,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=1, frames=120)
+ALONE = True
+COST_S = 60.0

@@ -25,7 +25,7 @@ from cotarget.evaluation import TruthDetector, true_calibration
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
-from experiments.engine.texts import table
+from experiments.tables import columns
 
 TARGET = "bird"
 BACKLASH_DEG = 0.05
@@ -105,7 +105,7 @@ def main() -> None:
     for loop in (options.loop,) if options.loop else LOOPS:
         found = aged(loop, options.minutes)
         shown = sorted({minute for minute in (*PRINTED, options.minutes) if minute <= options.minutes})
-        print(f"{loop}\n" + table(("minute", "ms a step", "resident MB"), [[m, *found[m - 1]] for m in shown]))
+        print(f"{loop}\n" + columns(("minute", "ms a step", "resident MB"), [[m, *found[m - 1]] for m in shown]))
         ms, mb = (found[-1][i] / found[0][i] for i in range(2))
         print(f"last minute over first: time {ms:.3f}, memory {mb:.3f}; at most {WANTED:g} is wanted\n")
 

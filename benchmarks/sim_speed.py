@@ -10,32 +10,29 @@ medians over the steps.
 3. Seconds of simulated time per second of the whole pipeline following a bird, as in `experiments.following.hold`: both
    cameras rendered with all effects; and nothing rendered, with detections from ground truth. For the latter, the time
    of the simulation alone is given too.
-
-    python -m benchmarks.sim_speed [--seeds 1] [--seed-base 0] [--quick] [--out DIR]
 """
 
 import math
-import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from annotated_types import Gt, Le
 
 from benchmarks.plain_renderer import PlainRenderer
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.evaluation import TruthDetector
 from cotarget.pipeline import FollowSettings, Step
+from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
-from experiments.engine.checks import check_above, check_ways
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.texts import table
+from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated, target_of, watched, watched_in
 from experiments.following.field_scenes import hold_config
+from experiments.tables import outside
 
 IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")
 TARGET = "bird"
@@ -61,29 +58,21 @@ class SimSpeedSettings(FieldSettings):
         seconds_rendered: length of the run with pictures [s].
     """
 
-    seeds: int = 1
-    steps: int = 60
-    seconds_rendered: float = 6.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_above(self.lasting_s[0], self, "seconds_rendered")
-        check_ways(self, "seconds_rendered")
-
-    @property
-    def lasting_s(self) -> tuple[float, float]:
-        """Limits of a run's length [s]; timing starts after SETTLED_S, and the paths last longer by that."""
-        return 0.0, super().lasting_s[1]
+    seeds: Count = 1
+    steps: Count = 60
+    # Timing starts after SETTLED_S, and the paths last longer by that.
+    seconds: Annotated[float, Gt(0), Le(SECONDS)] = SECONDS
+    seconds_rendered: Annotated[float, Gt(0), Le(SECONDS)] = 6.0
 
 
-def one(calibration: Calibration, settings: SimSpeedSettings, seed: int) -> list[Row]:
+def one(settings: SimSpeedSettings, seed: int) -> list[Row]:
     """Time all cases once; give a row per step."""
     rows = _beside_renderer(settings, seed)
     for effects in (*((name,) for name in IMAGE_EFFECTS), IMAGE_EFFECTS):
         rows += _beside_none(settings, seed, effects)
     for what, steps in (
-        ("rendered", held(calibration, settings.seconds_rendered, seed)),
-        ("unrendered", held_unrendered(calibration, settings.seconds, seed)),
+        ("rendered", held(calibrated(settings), settings.seconds_rendered, seed)),
+        ("unrendered", held_unrendered(calibrated(settings), settings.seconds, seed)),
     ):
         rows.append({"seed": seed, "what": what, "factor": real_time_factor(steps)})
     rows.append({"seed": seed, "what": "simulation alone", "ms": _alone(settings, seed)})
@@ -224,52 +213,10 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List the figures that miss their goal."""
-    return [key for key, (low, high) in WANTED.items() if not low <= summary[key] <= high]
-
-
-def describe(settings: SimSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as tables."""
-    lines = [
-        f"a step: a frame of each camera, states and commands; medians of {settings.steps} steps, {seeds_of(settings)}",
-        f"image effects off: {summary['loop_ms']:.1f} ms, mujoco.Renderer {summary['renderer_ms']:.1f} ms, ratio "
-        f"{summary['loop_over_renderer']:.2f}; at most {WANTED['loop_over_renderer'][1]:g} is wanted",
-        table(
-            ("image effect", "ms", "without", "its share [ms]"),
-            ([n, *v.values()] for n, v in summary["effects"].items()),
-        ),
-        f"real-time factor of the pipeline: both cameras rendered, all effects {summary['real_time_rendered']:.2f}; "
-        f"nothing rendered {summary['real_time_unrendered']:.1f}, of which the simulation itself takes "
-        f"{summary['simulation_alone_ms']:.2f} ms a step; at least {WANTED['real_time_rendered'][0]:g} and "
-        f"{WANTED['real_time_unrendered'][0]:g} are wanted",
-    ]
-    return "\n".join(lines)
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Milliseconds of each effect."""
-    found = summarise(rows)
-    ax = figure.subplots()
-    names = [RENDERER, LOOP, *found["effects"]]
-    values = [found["renderer_ms"], found["loop_ms"], *(v["ms"] for v in found["effects"].values())]
-    ax.bar(names, values)
-    ax.set(ylabel="ms a step, two frames")
-    ax.tick_params(axis="x", rotation=20)
+    return outside(summary, WANTED)
 
 
 SETTINGS = SimSpeedSettings()
-EXPERIMENT = Experiment(
-    "sim_speed",
-    "The simulation's speed, beside mujoco.Renderer, effect by effect and against real time.",
-    SETTINGS,
-    replace(SETTINGS, seeds=1, steps=3, seconds_rendered=0.4, seconds=2.0, calibrated=False),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    prepare=calibrated,
-    alone=True,
-    cost_s=120.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=1, steps=3, seconds_rendered=0.4, seconds=2.0, calibrated=False)
+ALONE = True
+COST_S = 120.0

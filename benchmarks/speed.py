@@ -4,29 +4,25 @@ There are 40 views of a board by two cameras, 20 pairs with the head at home; bo
 wanted. The ways are `calibrate_views` without held-out captures, and cv2.calibrateCamera for each camera followed by
 cv2.stereoCalibrate, with fixed intrinsics and with everything free, as in the joint fit. They take turns, because a
 machine's speed drifts; figures are medians over the seeds, on each way's default number of threads.
-
-    python -m benchmarks.speed [--seeds 5] [--seed-base 0] [--quick] [--out DIR]
 """
 
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
+from annotated_types import Ge
 
 from cotarget.board import board_points
 from cotarget.calibration import Options, View, calibrate_views
 from cotarget.calibration.initialization import FEWEST_VIEWS
 from cotarget.config import BoardConfig
+from cotarget.schema import Positive
 from experiments.calibration.synthetic.rig import SIZE, SIZES, Truth
 from experiments.calibration.synthetic.views import synthetic_views
-from experiments.engine.checks import check_least
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import table
+from experiments.engine import Count, Row, Settings
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -38,17 +34,12 @@ JOINT, HELD, FREE = "joint fit", "OpenCV, intrinsics held", "OpenCV, everything 
 class SpeedSettings(Settings):
     """Settings: pairs of views, and noise of corners [px]."""
 
-    seeds: int = 5
-    pairs: int = 20
-    noise_px: float = 0.2
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_least(FEWEST_VIEWS, self, "pairs")
+    seeds: Count = 5
+    pairs: Annotated[int, Ge(FEWEST_VIEWS)] = 20
+    noise_px: Positive = 0.2
 
 
-def one(_: None, settings: SpeedSettings, seed: int) -> list[Row]:
+def one(settings: SpeedSettings, seed: int) -> list[Row]:
     """Time each way once; give a row per way."""
     views = synthetic_views(
         TRUTH,
@@ -109,35 +100,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     return found
 
 
-def describe(settings: SpeedSettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as a table."""
-    return f"{2 * settings.pairs} views of two cameras, median of {seeds_of(settings)}\n" + table(
-        ("way", "seconds", "joint / this", "baseline off, rms [mm]"),
-        ([way, *found.values()] for way, found in summary.items()),
-    )
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Seconds of each seed."""
-    ax = figure.subplots()
-    for way in (JOINT, HELD, FREE):
-        ax.semilogy([row["seconds"] for row in rows if row["way"] == way], "o-", label=way)
-    ax.set(xlabel="seed", ylabel="seconds")
-    ax.legend(frameon=False)
-
-
 SETTINGS = SpeedSettings()
-EXPERIMENT = Experiment(
-    "speed",
-    "Seconds of the joint fit of 40 views of two cameras, beside OpenCV's.",
-    SETTINGS,
-    replace(SETTINGS, seeds=1, pairs=8),
-    one,
-    summarise,
-    describe,
-    plot,
-    alone=True,
-    cost_s=5.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=1, pairs=8)
+ALONE = True
+COST_S = 5.0

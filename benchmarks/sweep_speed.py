@@ -1,48 +1,43 @@
-"""Speed of a sweep with two processes against one, and equality of their rows.
+"""Speed of a sweep with two workers against one, and equality of their rows.
 
-The same seeds of two experiments, one that fits and one that renders, are run by one process and by two, in turns
-because a machine's speed drifts, each process with one thread. The time is that of the whole sweep with the start of
-its processes. Rows must be equal number by number; jobs with different rows are counted.
-
-    python -m benchmarks.sweep_speed [--seeds 1: times] [--quick] [--out DIR]
+The same seeds of two experiments, one that fits and one that renders, are run by one worker and by two, in turns
+because a machine's speed drifts, each worker with one thread. The time is that of the whole sweep with the start of its
+workers. Rows must be equal number by number; seeds with different rows are counted.
 """
 
-import functools
-import json
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from cotarget.detection import make_detector
+from cotarget.schema import Positive
 from cotarget.sim.world import SimWorld
 from experiments.calibration import chain
-from experiments.engine.harness import Experiment, Row, Settings
-from experiments.engine.texts import table
-from experiments.engine.workers import in_processes
+from experiments.engine import Case, Count, Experiment, Job, Row, Settings, csv_of, on_dask
 from experiments.following.field_scenes import hold_config
+from experiments.tables import grouped, spread_columns
 
 PROCESSES = (1, 2)
-WANTED = 1.8  # goal: speed of two processes over one
+WANTED = 1.9  # goal: speed of two workers over one
 
 
 @dataclass(frozen=True)
 class SweepSpeedSettings(Settings):
     """Settings: repetitions as seeds, jobs per sweep, and length of a rendered job's run [s]."""
 
-    seeds: int = 1
-    jobs: int = 12
-    seconds: float = 2.0
+    seeds: Count = 1
+    jobs: Count = 12
+    seconds: Positive = 2.0
 
 
 def fitted(settings: SweepSpeedSettings, number: int) -> list[Row]:
     """Run a job that fits: the chain's quick run."""
     del settings
-    return chain.one(None, chain.EXPERIMENT.quick, number)
+    return chain.one(chain.QUICK, number)
 
 
 def rendered(settings: SweepSpeedSettings, number: int) -> list[Row]:
@@ -55,38 +50,38 @@ def rendered(settings: SweepSpeedSettings, number: int) -> list[Row]:
             frame = rig.fixed.read(newer_than=t)
             t = frame.t
             shown, found = rig.zoom.read(), detector.detect(frame)
-            rows.append({"t": t, "grey": float(shown.image.mean()), "u": [float(one.center_px[0]) for one in found]})
+            rows.append({"t": t, "grey": float(shown.image.mean()), "u": sum(float(one.center_px[0]) for one in found)})
     return rows
 
 
 SWEEPS = {"fitted": fitted, "rendered": rendered}
 
 
-def one(_: None, settings: SweepSpeedSettings, seed: int) -> list[Row]:
-    """Run each sweep with each number of processes; give a row per run."""
+def one(settings: SweepSpeedSettings, seed: int) -> list[Row]:
+    """Run each sweep with each number of workers; give a row per run."""
     rows: list[Row] = []
-    numbers = range(seed * settings.jobs, (seed + 1) * settings.jobs)
     for sweep, job in SWEEPS.items():
-        first: list[str] = []
+        case = Case(Experiment(sweep, "", settings, settings, job, spread_columns), settings, Path())
+        jobs = [Job(case, number) for number in range(seed * settings.jobs, (seed + 1) * settings.jobs)]
+        first: dict[int, bytes] = {}
         for processes in PROCESSES if seed % 2 == 0 else PROCESSES[::-1]:
             began = time.perf_counter()
-            found = dict(in_processes(functools.partial(job, settings), numbers, processes))
-            seconds = time.perf_counter() - began
-            told = [json.dumps(found[i]) for i in range(len(numbers))]
-            first = first or told
-            differ = sum(a != b for a, b in zip(first, told, strict=True))
+            with on_dask(processes, None) as run:
+                found = {job.number: csv_of(done.rows) for job, done in run(jobs)}
+                seconds = time.perf_counter() - began
+            first = first or found
+            differ = sum(first[number] != found[number] for number in first)
             rows.append({"seed": seed, "sweep": sweep, "processes": processes, "seconds": seconds, "differ": differ})
     return rows
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Give each sweep's median seconds, the speed of two processes over one, and the number of jobs with other rows."""
+    """Give each sweep's median seconds, the speed of two workers over one, and the number of jobs with other rows."""
     found: dict[str, Any] = {}
-    for sweep in dict.fromkeys(row["sweep"] for row in rows):
-        mine = [row for row in rows if row["sweep"] == sweep]
-        took = {p: np.array([row["seconds"] for row in mine if row["processes"] == p]) for p in PROCESSES}
+    for sweep, mine in grouped(rows, "sweep").items():
+        took = {p: np.array([row["seconds"] for row in each]) for p, each in grouped(mine, "processes").items()}
         found[sweep] = {
-            **{f"{p}_s": float(np.median(seconds)) for p, seconds in took.items()},
+            **{f"{p}_s": float(np.median(took[p])) for p in PROCESSES},
             "faster": float(np.median(took[PROCESSES[0]] / took[PROCESSES[1]])),
             "rows_that_differ": sum(row["differ"] for row in mine),
         }
@@ -99,41 +94,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     return slow + [f"{sweep}: rows differ" for sweep, found in summary.items() if found["rows_that_differ"]]
 
 
-def describe(settings: SweepSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per sweep."""
-    lines = [
-        [sweep, found["1_s"], found["2_s"], found["faster"], f">= {WANTED:g}", found["rows_that_differ"]]
-        for sweep, found in summary.items()
-    ]
-    return f"sweeps of {settings.jobs} jobs, medians of {settings.seeds} times\n" + table(
-        ("sweep", "one process [s]", "two [s]", "times as fast", "wanted", "rows that differ"), lines
-    )
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Seconds of each sweep, by one process and by two."""
-    ax = figure.subplots()
-    for sweep in dict.fromkeys(row["sweep"] for row in rows):
-        for seed in dict.fromkeys(row["seed"] for row in rows):
-            mine = sorted((r["processes"], r["seconds"]) for r in rows if (r["sweep"], r["seed"]) == (sweep, seed))
-            ax.plot(*zip(*mine, strict=True), "o-", label=f"{sweep}, {seed}")
-    ax.set(xlabel="processes", ylabel="seconds", xticks=PROCESSES, ylim=(0, None))
-    ax.legend(frameon=False)
-
-
 SETTINGS = SweepSpeedSettings()
-EXPERIMENT = Experiment(
-    "sweep_speed",
-    "What a second process is worth to a sweep, and that it changes no row.",
-    SETTINGS,
-    replace(SETTINGS, seeds=1, jobs=2, seconds=0.2),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    alone=True,
-    cost_s=200.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=1, jobs=2, seconds=0.2)
+ALONE = True
+COST_S = 200.0

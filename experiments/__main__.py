@@ -1,17 +1,18 @@
-"""Run experiments with `python -m experiments`; see `experiments.engine.command`."""
+"""Run experiments with `python -m experiments`; see `experiments.command`."""
 
+import signal
 import sys
-
-INTERRUPTED = 130  # exit status of Ctrl-C; a copy, because `experiments.engine.harness` takes a second to load
 
 
 def main() -> int:
-    """Run the command; Ctrl-C while its modules load, which takes a second or two, ends in one line too."""
+    """Run the command; Ctrl-C while its modules load, which takes a second, ends in one line too."""
     try:
-        from experiments.engine.command import main as run
+        from experiments.command import TERMINATED
+        from experiments.command import main as run
     except KeyboardInterrupt:
         print("python -m experiments: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return 130
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # an exit ends the workers too
     return run()
 
 

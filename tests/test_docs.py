@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.engine.workers import here
+from experiments.engine import experiment_of, pictured
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(path for path in (ROOT / "docs").rglob("*.md") if path.name != "upgrading.md")  # it lists what there was
@@ -45,9 +45,10 @@ def test_every_linked_file_exists(page):
 
 def test_the_experiment_that_the_documentation_adds_runs(monkeypatch):
     text = (ROOT / "docs/experiments.md").read_text(encoding="utf-8")
-    (block,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "EXPERIMENT = " in block)
+    (block,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "SETTINGS = " in block)
     module = types.ModuleType("rounding")
     monkeypatch.setitem(sys.modules, "rounding", module)  # dataclasses look there
     exec(block, module.__dict__)
-    rows = module.EXPERIMENT.run(module.EXPERIMENT.quick, here)
-    assert module.missed(module.summarise(rows)) == []
+    experiment = experiment_of(module)
+    rows = [row for seed in experiment.quick.numbers for row in pictured(experiment.one(experiment.quick, seed)).rows]
+    assert experiment.missed(experiment.summarise(rows)) == []

@@ -2,6 +2,7 @@
 
 import io
 import re
+from argparse import Namespace
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -10,8 +11,8 @@ import pytest
 from cotarget import cli
 from cotarget.backends import load_config
 from cotarget.sim.world import SimWorld
-from experiments.engine.cases import choose, known_experiments
-from experiments.engine.command import main
+from experiments.command import choose, main
+from experiments.engine import known_experiments
 from tests.support.target_models import BOX
 
 ROOT = Path(__file__).parents[1]
@@ -67,7 +68,8 @@ def test_experiments_and_their_options_exist():
             assert option in said.getvalue(), f"python -m experiments {option}"
         names = [word for word in re.findall(r"^ ([a-z][a-z0-9_ ]+)(?= |$)", rest) for word in word.split()]
         names = [name for name in names if name != EXAMPLE]
-        assert choose(known_names, names, changes=re.findall(r"--set '?([^\s']+=[^\s']+)", rest))
+        changes = re.findall(r"--set '?([^\s']+=[^\s']+)", rest)
+        assert choose(known_names, Namespace(names=names, set=changes, quick=False, seeds=None, seed_base=None))
 
 
 def test_every_command_is_documented(helps):

@@ -6,13 +6,9 @@ poses and noise. The pointing error is the angle between line of sight and true 
 at 4 to 30 m, pixel and depth given exactly; times 7155 it is the error in pixels at the longest focal length. In theory
 the error is proportional to the noise, and to one over the root of the placements, or falls faster where few of them
 leave parts of the view empty. The measured exponents are those of a plane fitted to the logarithms.
-
-    python -m experiments.calibration.calibration_budget [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out
-    DIR]
 """
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,12 +19,12 @@ from matplotlib.figure import Figure
 from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_views, predicted_pointing
 from cotarget.config import BoardConfig
+from cotarget.schema import Positive
 from experiments.calibration.synthetic.aims import draw_targets, misses
 from experiments.calibration.synthetic.rig import LONGEST_PX, SIZES, Truth
-from experiments.calibration.synthetic.views import Placing, spread_views
-from experiments.engine.checks import check_above, check_session
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.calibration.synthetic.views import Boards, Looks, Placing, spread_views
+from experiments.engine import Count, Row, Settings
+from experiments.tables import grouped, outside, quartiles, rms
 
 BOARD = BoardConfig()
 RIG = Truth()
@@ -48,20 +44,14 @@ class BudgetSettings(Settings):
         targets: number of targets on which the error is measured.
     """
 
-    seeds: int = 5
-    noises_px: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
-    placements: tuple[int, ...] = (6, 12, 24, 48)
-    looks: int = 4
-    targets: int = 100
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_above(0, self, "noises_px", "placements", "looks", "targets")
-        check_session(self, "placements", "looks")
+    seeds: Count = 5
+    noises_px: tuple[Positive, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
+    placements: tuple[Boards, ...] = (6, 12, 24, 48)
+    looks: Looks = 4
+    targets: Count = 100
 
 
-def one(_: None, settings: BudgetSettings, seed: int) -> list[Row]:
+def one(settings: BudgetSettings, seed: int) -> list[Row]:
     """Calibrate for each number of placements and each noise; give a row for each.
 
     Each calibration has its own random boards, poses and noise.
@@ -90,10 +80,9 @@ def one(_: None, settings: BudgetSettings, seed: int) -> list[Row]:
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Give rms over the seeds for each noise and number, and the exponents of the error."""
     cells = {}
-    for boards, noise_px in dict.fromkeys((row["placements"], row["noise_px"]) for row in rows):
-        mine = [row for row in rows if (row["placements"], row["noise_px"]) == (boards, noise_px)]
+    for (boards, noise_px), mine in grouped(rows, "placements", "noise_px").items():
         reached, predicted = (rms(row[f"{key}_px"] for row in mine) for key in ("reached", "predicted"))
-        cells[_cell(noise_px, boards)] = {
+        cells[f"corners {noise_px:g} px, {boards} placements"] = {
             "reached_px": reached,
             "predicted_px": predicted,
             "reached_deg": float(np.degrees(reached / LONGEST_PX)),
@@ -121,41 +110,15 @@ def exponents(rows: Sequence[Row], key: str = "reached_px") -> tuple[float, floa
     return with_noise, with_placements
 
 
-def _cell(noise_px: float, boards: int) -> str:
-    return f"corners {noise_px:g} px, {boards} placements"
-
-
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List what differs from theory or from the calibrations' own predictions, among what was measured."""
-    return [
-        f"{name} is {summary[name]:.2f}, not {low:g} to {high:g}"
-        for name, (low, high) in WANTED.items()
-        if not (math.isnan(summary[name]) or low <= summary[name] <= high)
-    ]
+    return outside(summary, {name: limits for name, limits in WANTED.items() if not math.isnan(summary[name])})
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Give each cell's error, and its ratio to the prediction."""
     cells = {cell: found["reached_px"] for cell, found in summary["cells"].items()}
     return {"reached_px": cells, "reached_over_predicted": summary["reached_over_predicted"]}
-
-
-def describe(settings: BudgetSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per number of placements: measured over predicted for each noise."""
-    cells = summary["cells"]
-    lines = []
-    for boards in settings.placements:
-        found = [cells[_cell(noise_px, boards)] for noise_px in settings.noises_px]
-        texts = [f"{each['reached_px']:.3f} / {each['predicted_px']:.3f}" for each in found]
-        lines.append([f"{boards} placements, {boards * settings.looks} poses", *texts])
-    return "\n".join(
-        [
-            f"rms pointing error, reached / predicted [px at f = {LONGEST_PX:g} px], {seeds_of(settings)}",
-            table(["", *(f"corners {noise_px:g} px" for noise_px in settings.noises_px)], lines),
-            f"grows as noise^{summary['exponent_noise']:.2f} and placements^{summary['exponent_placements']:.2f}; "
-            f"reached over predicted {summary['reached_over_predicted']:.2f}",
-        ]
-    )
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
@@ -168,13 +131,10 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     for ax, (x_key, of, label) in zip(figure.subplots(1, 2, sharey=True), panels, strict=True):
         for i, value in enumerate(sorted({row[of] for row in rows})):
             mine = [row for row in rows if row[of] == value]
-            xs = sorted({row[x_key] for row in mine})
-            found = [[row for row in mine if row[x_key] == x] for x in xs]
             name = f"{value:g} px" if of == "noise_px" else f"{value:g} placements"
-            values = [np.percentile([row["reached_px"] for row in f], [25, 50, 75]) for f in found]
-            low, mid, high = np.array(values).T
-            ax.errorbar(xs, mid, [mid - low, high - mid], fmt="o", ms=4, capsize=2, color=f"C{i}", label=name)
-            ax.plot(xs, [np.median([row["predicted_px"] for row in f]) for f in found], color=f"C{i}", lw=1)
+            xs = quartiles(ax, mine, x_key, "reached_px", color=f"C{i}", label=name)
+            predicted = [[row["predicted_px"] for row in mine if row[x_key] == x] for x in xs]
+            ax.plot(xs, np.median(predicted, axis=1), color=f"C{i}", lw=1)
         ax.set(xscale="log", yscale="log", xlabel=label)
         ax.set_xticks(xs, [f"{x:g}" for x in xs], minor=False)
         ax.minorticks_off()
@@ -184,18 +144,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = BudgetSettings()
-EXPERIMENT = Experiment(
-    "calibration_budget",
-    "What corners' noise and the number of placements leave of pointing error, beside what is predicted.",
-    SETTINGS,
-    replace(SETTINGS, seeds=2, noises_px=(0.05, 0.2), placements=(6, 12)),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    cost_s=30.0,
-    bounded=bounded,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=2, noises_px=(0.05, 0.2), placements=(6, 12))
+COST_S = 30.0

@@ -7,14 +7,10 @@ fixed view at 4 to 30 m, pixel and depth given exactly; times 7155 it is the err
 length. The joint fit is compared with its own prediction, the Cramer-Rao bound for the true noise, that bound with
 known intrinsics, and the sequential method. The rigs are the default one; one with a wide baseline, toed in and rolled,
 with a long lever; and the default one with the usual board of 9 x 6 corners.
-
-    python -m experiments.calibration.chain [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -26,12 +22,12 @@ from cotarget.calibration.initialization import place_boards
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array
+from cotarget.schema import Positive
 from experiments.calibration.synthetic.aims import draw_targets, misses
 from experiments.calibration.synthetic.rig import LONGEST_PX, SIZES, Truth, other_rig
-from experiments.calibration.synthetic.views import Placing, spread_views
-from experiments.engine.checks import check_session
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.calibration.synthetic.views import Boards, Looks, Placing, spread_views
+from experiments.engine import Count, Row, Settings
+from experiments.tables import grouped, rms
 
 FINE_BOARD = BoardConfig(corners=(14, 11), square=0.068)
 CASES = {
@@ -47,20 +43,15 @@ FIGURES = ("joint", "predicted", "bound", "bound_intrinsics_known", "sequential"
 class ChainSettings(Settings):
     """Settings: noise of corners [px], boards, head poses per board, targets per seed, and cases."""
 
-    seeds: int = 20
-    noise_px: float = 0.2
-    boards: int = 15
-    looks: int = 6
-    targets: int = 100
+    seeds: Count = 20
+    noise_px: Positive = 0.2
+    boards: Boards = 15
+    looks: Looks = 6
+    targets: Count = 100
     cases: tuple[str, ...] = tuple(CASES)
 
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_session(self, "boards", "looks")
 
-
-def one(_: None, settings: ChainSettings, seed: int) -> list[Row]:
+def one(settings: ChainSettings, seed: int) -> list[Row]:
     """Calibrate every case once; give a row per case."""
     return [_row(settings, seed, case) for case in settings.cases]
 
@@ -108,24 +99,14 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Give rms over the seeds [px at f = 7155 px]."""
     return {
         case: {f"{name}_px": rms(row[f"{name}_px"] for row in mine) for name in FIGURES}
-        for case in CASES
-        if (mine := [row for row in rows if row["case"] == case])
+        for case, mine in grouped(rows, "case").items()
     }
-
-
-def describe(settings: ChainSettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as a table."""
-    return f"rms pointing error [px at f = 7155 px], {seeds_of(settings)}\n" + table(
-        ("case", "joint", "predicted", "Cramer-Rao", "intrinsics known", "sequential"),
-        ([case, *(found[f"{name}_px"] for name in FIGURES)] for case, found in summary.items()),
-    )
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Measured beside predicted error of each seed."""
     ax = figure.subplots()
-    for case in CASES:
-        mine = [row for row in rows if row["case"] == case]
+    for case, mine in grouped(rows, "case").items():
         ax.plot([row["predicted_px"] for row in mine], [row["joint_px"] for row in mine], ".", label=case)
     top = max(row["joint_px"] for row in rows)
     ax.plot([0, top], [0, top], "k", lw=0.8)
@@ -134,16 +115,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = ChainSettings()
-EXPERIMENT = Experiment(
-    "chain",
-    "Pointing of a rig calibrated from synthetic corners, beside the prediction and the Cramer-Rao bound.",
-    SETTINGS,
-    replace(SETTINGS, seeds=2, boards=10, looks=4, cases=("toed-in rig", "default rig, 9x6 board")),
-    one,
-    summarise,
-    describe,
-    plot,
-    cost_s=15.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=2, boards=10, looks=4, cases=("toed-in rig", "default rig, 9x6 board"))
+COST_S = 15.0

@@ -4,16 +4,14 @@ A board of 0.89 x 0.67 m is 3 m away, the head turns as far as the board stays i
 have noise of 0.2 px. Park and Martin's closed form and the weighted fit over poses get the board's pose in each view;
 the joint fit uses the corners. Errors are root mean squares over the seeds; the bound is computed for each seed's own
 poses.
-
-    python -m experiments.calibration.hand_eye [--seeds 100] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
@@ -25,11 +23,11 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import base_head
 from cotarget.rig_geometry import FixedCamera, ZoomHead
+from cotarget.schema import Positive
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Truth
 from experiments.calibration.synthetic.views import noisy, seen_from
-from experiments.engine.checks import check_above, check_least
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.engine import Row, Settings
+from experiments.tables import rms
 
 LENS = Lens(693.0, 693.0, 319.5, 239.5)
 COLUMNS, ROWS, WIDTH, HEIGHT = 14, 11, 0.89, 0.67  # number of corners, and distance of the outer ones [m]
@@ -46,17 +44,11 @@ FEWEST_POSES = 3  # least number that determines T: two poses rotate the head ab
 class HandEyeSettings(Settings):
     """Settings: number of poses, and noise of corners [px]."""
 
-    poses: int = 20
-    noise_px: float = 0.2
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_least(FEWEST_POSES, self, "poses")
-        check_above(0, self, "noise_px")  # the bound is 0 without noise
+    poses: Annotated[int, Ge(FEWEST_POSES)] = 20
+    noise_px: Positive = 0.2  # the bound is 0 without noise
 
 
-def one(_: None, settings: HandEyeSettings, seed: int) -> list[Row]:
+def one(settings: HandEyeSettings, seed: int) -> list[Row]:
     """Draw poses and noise, solve by each method; give a row per method."""
     rng = np.random.default_rng((seed, 1))
     truth = Truth(zoom=LENS, dz=0.0, eps=0.0)
@@ -133,15 +125,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     return found
 
 
-def describe(settings: HandEyeSettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as a table."""
-    keys = ("rotation_deg", "translation_mm", "rotation_ratio", "translation_ratio", "inside")
-    return f"T from {settings.poses} poses, rms over {seeds_of(settings)}\n" + table(
-        ("method", "rotation [deg]", "translation [mm]", "x bound", "x bound", "in 90 % ellipsoid"),
-        ([method, *(found.get(key, float("nan")) for key in keys)] for method, found in summary.items()),
-    )
-
-
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Cumulative errors of the methods."""
     for ax, key, unit in zip(figure.subplots(1, 2), ("rotation_deg", "translation_mm"), ("deg", "mm"), strict=True):
@@ -154,16 +137,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = HandEyeSettings()
-EXPERIMENT = Experiment(
-    "hand_eye",
-    "T from 20 poses of one board, by each method, beside the Cramer-Rao bound.",
-    SETTINGS,
-    replace(SETTINGS, seeds=5),
-    one,
-    summarise,
-    describe,
-    plot,
-    cost_s=0.3,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=5)
+COST_S = 0.3

@@ -4,14 +4,10 @@ There are 12 boards of 9 x 6 corners at 2.5 to 8 m, four head poses each, and co
 default one and one with a wide baseline, toed in and rolled. Each seed draws its own boards, poses and noise. No
 captures are held out, because they could only widen the ellipses. The measured and the predicted pointing error are
 given for the same targets.
-
-    python -m experiments.calibration.honesty [--seeds 60] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -21,12 +17,12 @@ from cotarget.board import board_points
 from cotarget.calibration import Calibration, Options, calibrate_views, predicted_pointing
 from cotarget.calibration.bundle import ALL_BLOCKS, parameter_names
 from cotarget.config import BoardConfig
+from cotarget.schema import Positive
 from experiments.calibration.synthetic.aims import draw_targets, misses
 from experiments.calibration.synthetic.rig import LONGEST_PX, SIZES, Truth, other_rig
-from experiments.calibration.synthetic.views import Placing, spread_views
-from experiments.engine.checks import check_session
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.calibration.synthetic.views import Boards, Looks, Placing, spread_views
+from experiments.engine import Count, Row, Settings
+from experiments.tables import grouped, rms
 
 BOARD = BoardConfig()
 RIGS = {"default rig": Truth(), "toed-in rig": other_rig()}
@@ -44,19 +40,14 @@ GROUPS = {
 class HonestySettings(Settings):
     """Settings: boards, head poses per board, targets, and noise of corners [px]."""
 
-    seeds: int = 60
-    boards: int = 12
-    looks: int = 4
-    noise_px: float = 0.1
-    targets: int = 20
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_session(self, "boards", "looks")
+    seeds: Count = 60
+    boards: Boards = 12
+    looks: Looks = 4
+    noise_px: Positive = 0.1
+    targets: Count = 20
 
 
-def one(_: None, settings: HonestySettings, seed: int) -> list[Row]:
+def one(settings: HonestySettings, seed: int) -> list[Row]:
     """Calibrate both rigs once; give a row per rig."""
     return [_row(settings, seed, rig) for rig in RIGS]
 
@@ -129,40 +120,20 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
             "measured_over_predicted": rms(r["measured_px"] for r in mine) / rms(r["predicted_px"] for r in mine),
             "jittered": float(np.mean([row["jitter_deg"] > 0 for row in mine])),
         }
-        for rig in RIGS
-        if (mine := [row for row in rows if row["rig"] == rig])
+        for rig, mine in grouped(rows, "rig").items()
     }
-
-
-def describe(settings: HonestySettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as a table, a column per rig."""
-    names = list(dict.fromkeys(name for found in summary.values() for name in found))
-    lines = ([name.replace("_", " "), *(float(found[name]) for found in summary.values())] for name in names)
-    head = f"{100 * LEVEL:.0f} % ellipses that hold the truth; pointing at f = 7155 px, {seeds_of(settings)}"
-    return head + "\n" + table(("of", *summary), lines)
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Measured over predicted pointing error of each seed."""
     ax = figure.subplots()
-    for rig in RIGS:
-        ratios = [row["measured_px"] / row["predicted_px"] for row in rows if row["rig"] == rig]
+    for rig, mine in grouped(rows, "rig").items():
+        ratios = [row["measured_px"] / row["predicted_px"] for row in mine]
         ax.hist(ratios, bins=np.linspace(0, 3, 31).tolist(), histtype="step", label=rig)
     ax.set(xlabel="measured / predicted pointing error", ylabel="seeds")
     ax.legend(frameon=False)
 
 
 SETTINGS = HonestySettings()
-EXPERIMENT = Experiment(
-    "honesty",
-    "How many 90 % ellipses hold the truth.",
-    SETTINGS,
-    replace(SETTINGS, seeds=2, boards=8),
-    one,
-    summarise,
-    describe,
-    plot,
-    cost_s=5.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=2, boards=8)
+COST_S = 5.0

@@ -4,11 +4,8 @@ The default rig is used with 20 boards of 9 x 6 corners at 2.5 to 8 m, four head
 case adds one effect without a parameter in the model. The pointing error is measured with the same imperfect head, on
 targets over the fixed view at 4 to 30 m in turn, with exact pixel and distance (not depth, because a lens of another
 model has no defined axis). The goal is an error within twice the predicted one, or a refusal.
-
-    python -m experiments.calibration.mismatch [--seeds 4] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,11 +18,12 @@ from cotarget.calibration import View, calibrate_views, predicted_pointing
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
+from cotarget.schema import Positive
 from experiments.calibration.synthetic.aims import draw_targets, misses
 from experiments.calibration.synthetic.rig import LONGEST_PX, SIZES, Lens, Truth, with_lever_shifted
-from experiments.calibration.synthetic.views import Placing, spread_views
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.calibration.synthetic.views import Boards, Looks, Placing, spread_views
+from experiments.engine import Count, Row, Settings
+from experiments.tables import grouped, rms
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -125,15 +123,15 @@ QUICK_CASES = ("as modelled", "fixed lens thin prism", "backlash 0.1 deg", "angl
 class MismatchSettings(Settings):
     """Settings: boards, head poses per board, targets, noise of corners [px], and cases."""
 
-    seeds: int = 4
-    boards: int = 20
-    looks: int = 4
-    noise_px: float = 0.1
-    targets: int = 100
+    seeds: Count = 4
+    boards: Boards = 20
+    looks: Looks = 4
+    noise_px: Positive = 0.1
+    targets: Count = 100
     cases: tuple[str, ...] = tuple(CASES)
 
 
-def one(_: None, settings: MismatchSettings, seed: int) -> list[Row]:
+def one(settings: MismatchSettings, seed: int) -> list[Row]:
     """Calibrate every case once; give a row per case."""
     return [_row(settings, seed, case) for case in settings.cases]
 
@@ -178,8 +176,7 @@ def _row(settings: MismatchSettings, seed: int, name: str) -> Row:
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """Give rms values, ratios and refusals by case."""
     found: dict[str, dict[str, Any]] = {}
-    for case in dict.fromkeys(row["case"] for row in rows):
-        mine = [row for row in rows if row["case"] == case]
+    for case, mine in grouped(rows, "case").items():
         told = [row for row in mine if not row["refused"]]
 
         def of(key: str, told: Sequence[Row] = told) -> Array:
@@ -201,24 +198,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def describe(settings: MismatchSettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as a table."""
-    keys = (
-        "measured_px", "predicted_px", "ratio", "ratio_worst", "held_out_measured_px", "held_out_predicted_px",
-        "widened", "jitter_deg", "refused", "good",
-    )  # fmt: skip
-    head = ("case", "measured", "predicted", "ratio", "worst", "held out", "expected", "widened", "jitter", "refused")
-    lines = ([case, *(found[key] for key in keys)] for case, found in summary.items())
-    reasons = [f"{case}: {reason}" for case, found in summary.items() for reason in found["why_refused"]]
-    return "\n".join(
-        [
-            f"pointing [px at f = 7155 px], captures held out [px], jitter [deg], {seeds_of(settings)}",
-            table((*head, "within 2 or refused"), lines),
-            *reasons,
-        ]
-    )
-
-
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """The ratio of measured to predicted error, case by case."""
     ax = figure.subplots()
@@ -232,16 +211,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = MismatchSettings()
-EXPERIMENT = Experiment(
-    "mismatch",
-    "Rigs that have what the model lacks: within twice the predicted error, or refused.",
-    SETTINGS,
-    replace(SETTINGS, seeds=1, boards=15, looks=3, targets=30, cases=QUICK_CASES),
-    one,
-    summarise,
-    describe,
-    plot,
-    cost_s=40.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=1, boards=15, looks=3, targets=30, cases=QUICK_CASES)
+COST_S = 40.0

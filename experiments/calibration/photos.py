@@ -3,33 +3,25 @@
 For each pair, both cameras and Gamma are calibrated from all others; then they are held, and only the board's pose is
 fitted to the corners of both photos of the pair. All corners count. The photos are OpenCV's samples, looked for in
 ../shared/data/opencv_stereo beside the project, or one's own.
-
-    python -m experiments.calibration.photos [DIR] [--left 'left*.jpg'] [--right 'right*.jpg'] [--board 9x6] [--square
-    0.025]
-                                 [--processes P] [--quick] [--out DIR]
 """
 
-import os
-import sys
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from annotated_types import Ge
 
 from cotarget.board import board_points
 from cotarget.calibration import Calibration, Options, calibrate_photos, calibrate_views
 from cotarget.calibration.bundle import fit
 from cotarget.calibration.initialization import place_boards
 from cotarget.calibration.uncertainty import model_of
-from cotarget.cli.common import board_corners, positive, positive_int
-from cotarget.cli.main import Parser
 from cotarget.config import FEWEST_CORNERS, BoardConfig
-from experiments.engine.checks import check_above, check_least
-from experiments.engine.harness import Experiment, Row, Settings
-from experiments.engine.texts import rms, table
+from cotarget.schema import Positive
+from experiments.engine import Row, Settings
 
 NOT_HELD_OUT = Options(folds=0)
 PHOTOS = Path(__file__).resolve().parents[3] / "shared" / "data" / "opencv_stereo"
@@ -42,15 +34,9 @@ class PhotosSettings(Settings):
     directory: str = str(PHOTOS)
     left: str = "left*.jpg"
     right: str = "right*.jpg"
-    columns: int = 9
-    rows: int = 6
-    square: float = 0.025
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_least(FEWEST_CORNERS, self, "columns", "rows")
-        check_above(0, self, "square")
+    columns: Annotated[int, Ge(FEWEST_CORNERS)] = 9
+    rows: Annotated[int, Ge(FEWEST_CORNERS)] = 6
+    square: Positive = 0.025
 
 
 def needs(settings: PhotosSettings) -> str:
@@ -59,8 +45,9 @@ def needs(settings: PhotosSettings) -> str:
     return "" if there.is_dir() else f"needs photos in {there}, which are not part of the project"
 
 
+@functools.cache
 def whole(settings: PhotosSettings) -> Calibration:
-    """Calibrate from all pairs."""
+    """Calibrate from all pairs, once in a process."""
     board = BoardConfig(corners=(settings.columns, settings.rows), square=settings.square)
     return calibrate_photos(Path(settings.directory), settings.left, settings.right, board, options=NOT_HELD_OUT)
 
@@ -71,8 +58,9 @@ def jobs(settings: PhotosSettings) -> Sequence[int]:
     return range(min(settings.seeds, max(pairs, 1)))
 
 
-def one(calibration: Calibration, _: PhotosSettings, number: int) -> list[Row]:
+def one(settings: PhotosSettings, number: int) -> list[Row]:
     """Give the row of a left-out pair, and with the first one the row of all pairs."""
+    calibration = whole(settings)
     pairs = sorted({view.board for view in calibration.views})
     rows = [_all(calibration)] if number == 0 else []
     return rows + [_without(calibration, pair) for pair in pairs[number : number + 1]]
@@ -126,7 +114,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     whole, pairs = rows[0], rows[1:]
     squares = sum(row["left_out_rms_px"] ** 2 * row["corners"] for row in pairs)
     return {
-        **{key: value for key, value in whole.items() if key not in ("pair",)},
+        **{key: value for key, value in whole.items() if key not in ("pair", "left_out_rms_px")},
         "left_out_rms_px": float(np.sqrt(squares / sum(row["corners"] for row in pairs))),
         "left_out_worst_px": max(row["left_out_rms_px"] for row in pairs),
         "left_out_baseline_spread_mm": float(np.ptp([row["baseline_mm"] for row in pairs])),
@@ -134,65 +122,5 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def describe(_: PhotosSettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as a table, then the pairs."""
-    figures = [[name.replace("_", " "), value] for name, value in summary.items() if name != "left_out"]
-    pairs = [[name, value] for name, value in summary["left_out"].items()]
-    return table(("all photos", ""), figures) + "\n\n" + table(("pair left out", "rms [px]"), pairs)
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """The rms of each pair left out."""
-    ax = figure.subplots()
-    ax.bar(range(len(rows) - 1), [row["left_out_rms_px"] for row in rows[1:]])
-    ax.axhline(rms(row["left_out_rms_px"] for row in rows[1:]), color="k", lw=0.8)
-    ax.set(xlabel="pair left out", ylabel="rms [px]")
-
-
 SETTINGS = PhotosSettings()
-EXPERIMENT = Experiment(
-    "photos",
-    "Real stereo photos: rms, baseline, and each pair left out.",
-    SETTINGS,
-    replace(SETTINGS, seeds=2),
-    one,
-    summarise,
-    describe,
-    plot,
-    prepare=whole,
-    jobs=jobs,
-    needs=needs,
-)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command."""
-    parser = Parser(prog="python -m experiments.calibration.photos", description=EXPERIMENT.purpose)
-    parser.add_argument("directory", nargs="?", default=SETTINGS.directory, metavar="DIR", help="the photos")
-    parser.add_argument("--left", default=SETTINGS.left, metavar="GLOB")
-    parser.add_argument("--right", default=SETTINGS.right, metavar="GLOB")
-    board = (SETTINGS.columns, SETTINGS.rows)
-    parser.add_argument(
-        "--board", type=board_corners, default=board, metavar="CxR", help="inner corners ({}x{})".format(*board)
-    )
-    parser.add_argument("--square", type=positive, default=SETTINGS.square, metavar="M", help="side of a square [m]")
-    parser.add_argument("--processes", type=positive_int, default=os.cpu_count() or 1, metavar="P")
-    parser.add_argument("--quick", action="store_true", help="leave out two pairs only")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write result.json, rows.csv and figure.png there")
-    given = parser.parse_args(arguments)
-    columns, rows = given.board
-    settings = replace(
-        EXPERIMENT.quick if given.quick else SETTINGS,
-        directory=given.directory,
-        left=given.left,
-        right=given.right,
-        columns=columns,
-        rows=rows,
-        square=given.square,
-        processes=given.processes,
-    )
-    return EXPERIMENT.report(settings, given.out, quick=given.quick)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+QUICK = replace(SETTINGS, seeds=2)

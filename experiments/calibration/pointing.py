@@ -6,12 +6,9 @@ from rendered boards with all effects, once per seed. The pointing error is the 
 sight and the true target, for targets over the fixed view at 4 to 30 m, pixel and depth given exactly, at the shortest
 focal length. The full model is compared with the paper's shortcut in its two readings, and with a model that ignores
 the offsets between fixed camera, head and zoom camera.
-
-    python -m experiments.calibration.pointing [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -28,10 +25,9 @@ from cotarget.geometry import RigidTransform, pose
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Method
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.spread import in_words, points, spread
-from experiments.engine.texts import table
+from experiments.engine import Count, Row
 from experiments.following.own_rig import OwnRig
+from experiments.tables import grouped, outside, points, spreads
 
 RIGS = {
     "default": SimConfig(scene="indoor"),
@@ -51,20 +47,20 @@ MODELS: dict[str, tuple[Method, bool]] = {
 }
 OWN = "own"  # name of a user's own rig
 STREAM = 5  # random stream, separate from the world's
-# Goals for the full model's median over the seeds, at most [degrees].
-WANTED = {"median_deg": 0.003, "p95_deg": 0.006}
+# Goals for the full model's median over the seeds [degrees].
+WANTED = {"median_deg": (0.0, 0.003), "p95_deg": (0.0, 0.006)}
 
 
 @dataclass(frozen=True)
 class Settings(OwnRig):
     """Settings: targets per seed, and the rigs where no own one is given."""
 
-    seeds: int = 3
-    targets: int = 400
+    seeds: Count = 3
+    targets: Count = 400
     rigs: tuple[str, ...] = tuple(RIGS)
 
 
-def one(_: None, settings: Settings, seed: int) -> list[Row]:
+def one(settings: Settings, seed: int) -> list[Row]:
     """Calibrate every rig once; give a row with the error of each model [degrees]."""
     rows: list[Row] = []
     for rig in (OWN,) if settings.rig else settings.rigs:
@@ -105,63 +101,27 @@ def without_offsets(calibration: Calibration) -> Calibration:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
-    """Give median, least and largest over the seeds of each rig's and model's median and 95th percentile [degrees]."""
-    return {
-        rig: {
-            model: {
-                key: spread([row for row in rows if row["rig"] == rig and row["model"] == model], key) for key in WANTED
-            }
-            for model in MODELS
-        }
-        for rig in dict.fromkeys(row["rig"] for row in rows)
-    }
+    """Give the spread of each rig's and model's median and 95th percentile over the seeds [degrees]."""
+    return {rig: spreads(mine, "model", WANTED) for rig, mine in grouped(rows, "rig").items()}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List the figures of the full model that exceed their goal."""
-    return [
-        f"{rig}: {key}"
-        for rig, models in summary.items()
-        for key, most in WANTED.items()
-        if not models[FULL][key]["median"] <= most
-    ]
-
-
-def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
-    """Format a line per rig and model."""
-    lines = [
-        [f"{rig}: {model}", *(in_words(found[key], ".4f") for key in WANTED)]
-        for rig, models in summary.items()
-        for model, found in models.items()
-    ]
-    wanted = ["wanted of the full model", *(f"<= {most:g}" for most in WANTED.values())]
-    head = ("pointing error [degrees]", "median", "95th percentile")
-    return f"median (least to largest) of {seeds_of(settings)}\n" + table(head, [*lines, wanted])
+    return [text for rig, models in summary.items() for text in outside(models[FULL], WANTED, rig)]
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Median errors by model: the median over the seeds, least to largest, each seed a point."""
-    rigs = tuple(dict.fromkeys(row["rig"] for row in rows))
-    for ax, rig in zip(figure.subplots(1, len(rigs), sharey=True, squeeze=False)[0], rigs, strict=True):
-        for i, model in enumerate(MODELS):
-            errors = [row["median_deg"] for row in rows if row["rig"] == rig and row["model"] == model]
-            points(ax, i, errors, color=f"C{i}", label=model)
+    rigs = grouped(rows, "rig")
+    for ax, (rig, found) in zip(
+        figure.subplots(1, len(rigs), sharey=True, squeeze=False)[0], rigs.items(), strict=True
+    ):
+        for i, (model, mine) in enumerate(grouped(found, "model").items()):
+            points(ax, i, [row["median_deg"] for row in mine], color=f"C{i}", label=model)
         ax.set(title=rig, yscale="log", ylabel="median pointing error [degrees]", xticks=[])
     ax.legend(frameon=False)
 
 
 SETTINGS = Settings()
-EXPERIMENT = Experiment(
-    "pointing",
-    "How well a rig points after it was calibrated from rendered boards, and what simpler models lose.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, targets=50, rigs=("default",)),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    cost_s=90.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = dataclasses.replace(SETTINGS, seeds=1, targets=50, rigs=("default",))
+COST_S = 90.0

@@ -9,12 +9,9 @@ facing halfway between both, at 2.5 to 8 m, with squares of 0.1 m; from a baseli
 with it. A mounting from which the zoom camera cannot see a third of the fixed view is drawn again. Targets are over the
 fixed view at 4 to 30 m (growing in the same way), wherever the head reaches. The number of rigs beyond twice their
 predicted error is compared with the number expected by chance if every covariance is right.
-
-    python -m experiments.calibration.random_rigs [--seeds 50] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,9 +27,9 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from experiments.calibration.synthetic.aims import TARGET_DEPTHS, aimed, draw_targets, misses
 from experiments.calibration.synthetic.rig import LONGEST_PX, SIZES, Lens, Truth, truth_of, undistorted
-from experiments.calibration.synthetic.views import BOARD_DEPTHS, HEAD_LIMITS, Placing, spread_views
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.calibration.synthetic.views import BOARD_DEPTHS, HEAD_LIMITS, Boards, Looks, Placing, spread_views
+from experiments.engine import Count, Row, Settings
+from experiments.tables import rms
 
 BASELINES = (0.1, 10.0)  # [m]
 OUT_OF_PLANE = np.sin(np.radians(30.0))
@@ -48,10 +45,10 @@ CHANCE_DRAWS, CHANCE_TARGETS = 50, 50
 class RigsSettings(Settings):
     """Settings: boards, head poses per board, and targets per rig."""
 
-    seeds: int = 50
-    boards: int = 20
-    looks: int = 4
-    targets: int = 200
+    seeds: Count = 50
+    boards: Boards = 20
+    looks: Looks = 4
+    targets: Count = 200
 
 
 @dataclass(frozen=True)
@@ -64,7 +61,7 @@ class Drawn:
     redrawn: int
 
 
-def one(_: None, settings: RigsSettings, seed: int) -> list[Row]:
+def one(settings: RigsSettings, seed: int) -> list[Row]:
     """Draw a rig, calibrate it, and judge it; give one row."""
     rng = np.random.default_rng((seed, 4))
     rig = draw_rig(rng)
@@ -222,14 +219,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def describe(settings: RigsSettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as a table, with a line per rig that was refused or is too far off."""
-    lines = [[name.replace("_", " "), value] for name, value in summary.items() if not isinstance(value, Mapping)]
-    refused = [f"rig {seed} refused: {reason}" for seed, reason in summary["why_refused"].items()]
-    beyond = [f"rig {seed}: {ratio:.2f} times its predicted error" for seed, ratio in summary["beyond"].items()]
-    return "\n".join([f"random rigs, {seeds_of(settings)}", table(("what", "value"), lines), *refused, *beyond])
-
-
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """The ratio of measured to predicted error over the baseline."""
     found = [row for row in rows if not row["refused"]]
@@ -240,16 +229,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = RigsSettings()
-EXPERIMENT = Experiment(
-    "random_rigs",
-    "Random rigs: each calibrated within twice its own predicted error, or refused with the reason.",
-    SETTINGS,
-    replace(SETTINGS, seeds=3, boards=12, targets=50),
-    one,
-    summarise,
-    describe,
-    plot,
-    cost_s=5.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=3, boards=12, targets=50)
+COST_S = 5.0

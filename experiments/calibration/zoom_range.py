@@ -5,14 +5,11 @@ The pointing error is given at the shortest focal length and over all others: th
 targets over the fixed view at 4 to 30 m, pixel and depth given exactly. The errors of focal length and boresight at and
 between the zoom samples are given too. With steps, the aim is rounded to them, and the error is compared with that of a
 true calibration rounded in the same way.
-
-    python -m experiments.calibration.zoom_range [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
 import functools
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -30,10 +27,8 @@ from cotarget.geometry import angle_between
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
-from experiments.engine import harness
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.spread import spread_of
-from experiments.engine.texts import rms, table
+from experiments.engine import Count, Row, Settings
+from experiments.tables import grouped, outside, rms, spread
 
 # Goals for each head's figures, least and largest; with an ideal head nothing is rounded.
 WANTED: Mapping[str, tuple[float, float]] = {
@@ -52,15 +47,15 @@ SHARES, DEPTHS = np.linspace(0.05, 0.95, 4), np.array([5.0, 10.0, 25.0])
 
 
 @dataclass(frozen=True)
-class Settings(harness.Settings):
+class ZoomRangeSettings(Settings):
     """Settings: targets per focal length, and heads."""
 
-    seeds: int = 3
-    targets: int = 60
+    seeds: Count = 3
+    targets: Count = 60
     heads: tuple[str, ...] = tuple(HEADS)
 
 
-def one(_: None, settings: Settings, seed: int) -> list[Row]:
+def one(settings: ZoomRangeSettings, seed: int) -> list[Row]:
     """Calibrate with each head; give a row per focal length."""
     rows: list[Row] = []
     for head in settings.heads:
@@ -116,13 +111,10 @@ def lens_errors(calibration: Calibration, exact: Calibration, truth: Truth, nomi
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Give medians over the seeds, least and largest of the error over the range, and the worst error of the lens."""
     summary: dict[str, Any] = {}
-    for head in dict.fromkeys(row["head"] for row in rows):
-        mine = [row for row in rows if row["head"] == head]
+    for head, mine in grouped(rows, "head").items():
         shortest = min(row["nominal_px"] for row in mine)
         at_shortest = [row for row in mine if row["nominal_px"] == shortest]
-        by_seed: dict[int, list[Row]] = {}
-        for row in mine:
-            by_seed.setdefault(row["seed"], []).append(row)
+        by_seed = grouped(mine, "seed")
         found = {
             "calibrations": len(by_seed),
             "shortest_median_deg": median(row["median_deg"] for row in at_shortest),
@@ -150,17 +142,16 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 def _over_range(key: str, values: Sequence[Any]) -> dict[str, float]:
     """Give a figure's median over the seeds, with least and largest."""
-    found = spread_of(map(float, values))
+    found = spread(map(float, values))
     return {key: found["median"], f"{key}, least": found["least"], f"{key}, largest": found["largest"]}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List the figures that miss their goal."""
     return [
-        f"{head}: {key}"
+        text
         for head, found in summary.items()
-        for key, (low, high) in WANTED.items()
-        if key in found and not low <= found[key] <= high
+        for text in outside(found, {key: limits for key, limits in WANTED.items() if key in found}, head)
     ]
 
 
@@ -169,25 +160,12 @@ def median(values: Any) -> float:
     return float(np.median(list(values)))
 
 
-def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
-    """Format a line per figure, a column per head."""
-    names = list(dict.fromkeys(name for found in summary.values() for name in found))
-    lines = [
-        [
-            name,
-            *(found.get(name, float("nan")) for found in summary.values()),
-            "{:g}-{:g}".format(*WANTED[name]) if name in WANTED else "",
-        ]
-        for name in names
-    ]
-    return "\n".join([f"over the zoom range, {seeds_of(settings)}", table(["", *summary, "wanted"], lines)])
-
-
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Rms pointing error over the focal length and what each calibration predicts: medians, half the seeds shaded."""
-    heads = list(dict.fromkeys(row["head"] for row in rows))
-    for ax, head in zip(figure.subplots(1, len(heads), sharey=True, squeeze=False)[0], heads, strict=True):
-        mine = [row for row in rows if row["head"] == head]
+    heads = grouped(rows, "head")
+    for ax, (head, mine) in zip(
+        figure.subplots(1, len(heads), sharey=True, squeeze=False)[0], heads.items(), strict=True
+    ):
         focal = sorted({row["nominal_px"] for row in mine})
         for key, words in (("rms_deg", "measured"), ("predicted_deg", "predicted")):
             values = [[row[key] for row in mine if row["nominal_px"] == f] for f in focal]
@@ -201,18 +179,6 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
         ax.legend(frameon=False)
 
 
-SETTINGS = Settings()
-EXPERIMENT = Experiment(
-    "zoom_range",
-    "How well a rig points over its whole zoom range, calibrated from rendered boards.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, targets=20, heads=("steps",)),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    cost_s=120.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+SETTINGS = ZoomRangeSettings()
+QUICK = dataclasses.replace(SETTINGS, seeds=1, targets=20, heads=("steps",))
+COST_S = 120.0

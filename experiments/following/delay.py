@@ -5,13 +5,10 @@ of motion goes from 0 to 600 ms; three fifths are the cameras' and the rest that
 + 80 ms. Without prediction the head is sent to where the target was detected. The curve uses the fixed view alone,
 rendered once per seed. At the field's delay both can also be compared with correction from the zoom view (`--set
 delay.closed_loop=true`). A run in which the target was never acquired counts half the diagonal.
-
-    python -m experiments.following.delay [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,16 +16,15 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, SimZoomCamera
 from cotarget.metrics import score
 from cotarget.pipeline import FollowSettings
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.spread import in_words, spread_of
-from experiments.engine.texts import table
+from cotarget.schema import NotNegative
+from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated, held, target_of
 from experiments.following.field_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
 from experiments.following.wide_view import record
+from experiments.tables import grouped, spread
 
 FIELD_S = LATENCY_S + COMMAND_DELAY_S
 LIGHT_PART = LATENCY_S / FIELD_S  # part of a delay from light to frame
@@ -47,13 +43,13 @@ class DelaySettings(FieldSettings):
         closed_loop: whether both ways are also compared with the zoom view's correction, at the field's delay.
     """
 
-    seeds: int = 2
+    seeds: Count = 2
     targets: tuple[str, ...] = ("person", "bird")
-    delays: tuple[float, ...] = (0.0, 0.1, FIELD_S, 0.4, 0.6)
+    delays: tuple[NotNegative, ...] = (0.0, 0.1, FIELD_S, 0.4, 0.6)
     closed_loop: bool = False
 
 
-def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Row]:
+def one(settings: DelaySettings, seed: int) -> list[Row]:
     """Follow each target at each delay, with and without prediction; give a row per run."""
     cases = [(delay, predict, False) for delay in settings.delays for predict in (True, False)]
     if settings.closed_loop:
@@ -65,7 +61,7 @@ def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Ro
         for delay, predict, closed_loop in cases:
             late = delayed(config, delay)
             how = FollowSettings(predict=predict, closed_loop=closed_loop)
-            found = score(held(calibration, late, name, settings.seconds, how, view))
+            found = score(held(calibrated(settings), late, name, settings.seconds, how, view))
             rows.append(
                 {
                     "seed": seed,
@@ -93,28 +89,21 @@ def delayed(config: RigConfig, delay: float) -> RigConfig:
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Of each target the curve, over the seeds, and how many times prediction makes the median offset smaller."""
-    return {name: _of_target([row for row in rows if row["target"] == name]) for name in _targets(rows)}
-
-
-def _targets(rows: Sequence[Row]) -> list[str]:
-    return list(dict.fromkeys(row["target"] for row in rows))
+    return {name: _of_target(mine) for name, mine in grouped(rows, "target").items()}
 
 
 def _of_target(rows: Sequence[Row]) -> dict[str, Any]:
+    cells = grouped(rows, "delay_s", "closed_loop", "predict")
+
     def both(delay: float, closed_loop: bool) -> dict[str, Any]:
-        ways = [
-            [
-                r["tpo_width"]
-                for r in rows
-                if (r["delay_s"], r["closed_loop"], r["predict"]) == (delay, closed_loop, way)
-            ]
-            for way in (True, False)
-        ]
-        found = dict(zip(("with", "without"), map(spread_of, ways), strict=True))
+        ways = {"with": True, "without": False}
+        found: dict[str, Any] = {
+            name: spread(row["tpo_width"] for row in cells.get((delay, closed_loop, way), ()))
+            for name, way in ways.items()
+        }
         return found | {"times": found["without"]["median"] / found["with"]["median"]}
 
-    delays = sorted({row["delay_s"] for row in rows})
-    curve = {f"{1e3 * delay:.0f} ms": both(delay, False) for delay in delays}
+    curve = {f"{1e3 * delay:.0f} ms": both(delay, False) for delay in sorted({row["delay_s"] for row in rows})}
     return {"wide view alone": curve, "closed loop": both(FIELD_S, True)}
 
 
@@ -136,53 +125,22 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     return lost
 
 
-def describe(settings: DelaySettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per target and delay."""
-    lines: list[list[Any]] = []
-    for name, figures in summary.items():
-        shown = {f"{name}, {delay}": found for delay, found in figures["wide view alone"].items()}
-        if settings.closed_loop:
-            shown[f"{name}, {1e3 * FIELD_S:.0f} ms, closed loop"] = figures["closed loop"]
-        lines += [
-            [words, in_words(found["with"]), in_words(found["without"]), found["times"]]
-            for words, found in shown.items()
-        ]
-    return (
-        "median offset over the width, with prediction and without: "
-        f"median (least to largest) of {seeds_of(settings)}; "
-        f"at least {WANTED:g} times is wanted at {1e3 * FIELD_S:.0f} ms\n"
-        + table(("", "with", "without", "times"), lines)
-    )
-
-
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Offset over the delay: medians joined, bars from the least seed to the largest."""
-    names = _targets(rows)
-    for ax, name in zip(np.ravel(figure.subplots(1, len(names), sharey=True)), names, strict=True):
+    curves = grouped([row for row in rows if not row["closed_loop"]], "target")
+    for ax, (name, mine) in zip(np.ravel(figure.subplots(1, len(curves), sharey=True)), curves.items(), strict=True):
         for predict, label in ((True, "with prediction"), (False, "without")):
-            mine = [r for r in rows if (r["target"], r["predict"], r["closed_loop"]) == (name, predict, False)]
-            delays = sorted({row["delay_s"] for row in mine})
-            found = [spread_of(row["tpo_width"] for row in mine if row["delay_s"] == delay) for delay in delays]
-            low, middle, high = (np.array([each[key] for each in found]) for key in ("least", "median", "largest"))
-            ax.errorbar(1e3 * np.array(delays), middle, yerr=(middle - low, high - middle), capsize=3, label=label)
+            found = {
+                1e3 * delay: spread(row["tpo_width"] for row in each if row["predict"] is predict)
+                for delay, each in sorted(grouped(mine, "delay_s").items())
+            }
+            low, middle, high = (np.array([f[key] for f in found.values()]) for key in ("least", "median", "largest"))
+            ax.errorbar(list(found), middle, yerr=(middle - low, high - middle), capsize=3, label=label)
         ax.set_yscale("log")
         ax.set(title=name, xlabel="delay from light to motion [ms]", ylabel="median offset / width")
     ax.legend(frameon=False)
 
 
 SETTINGS = DelaySettings()
-EXPERIMENT = Experiment(
-    "delay",
-    "The offset in the close-up with prediction and without, over the delay of cameras and head.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, targets=("bird",), delays=(FIELD_S,), seconds=10.0, calibrated=False),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    prepare=calibrated,
-    cost_s=250.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = dataclasses.replace(SETTINGS, seeds=1, targets=("bird",), delays=(FIELD_S,), seconds=10.0, calibrated=False)
+COST_S = 250.0

@@ -14,28 +14,25 @@ view. With e = u_noise z / (f x_size) for pixels, their part does not depend on 
 approximation: a bar of the target's true size is projected, measured, and aimed at through
 `cotarget.camera.depth_from_size`, on rigs mounted by eye (`experiments.following.mounted`) that are known exactly. The
 fraction of the close-up's width is at the focal length that shows a bird of 0.8 m 160 px wide, within the lens's range.
-
-    python -m experiments.following.depth_error [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Gt
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.camera import depth_from_size
-from cotarget.errors import ConfigError
 from cotarget.geometry import Array
+from cotarget.schema import Positive
 from experiments.calibration.synthetic.aims import aim, looking_off
 from experiments.calibration.synthetic.rig import SIZE, Truth
-from experiments.engine.checks import check_above, check_least
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.engine import Count, Row, Settings
 from experiments.following.mounted import TARGET, at, cell_name, exact_calibration, mounted, off_px, wanted_focal_px
+from experiments.tables import grouped, quartiles, rms
 
 CAUSES = ("wrong size", "scatter", "pixels", "together")
 # Limits of Monte Carlo over first order, median over all. A size 10 % too large rotates by 1 / 1.1 of first order.
@@ -58,25 +55,16 @@ class DepthSettings(Settings):
         noise_px: noise of the measured size [px].
     """
 
-    seeds: int = 20
-    baselines: tuple[float, ...] = (0.1, 0.4, 1.5, 3.0)
-    depths: tuple[float, ...] = (5.0, 10.0, 20.0, 50.0, 100.0)
-    targets: int = 100
-    wrong: float = 0.1
-    scatter: float = 0.1
-    noise_px: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_above(0, self, "baselines", "depths", "targets", "scatter", "noise_px")
-        check_least(NEAREST_M, self, "depths")
-        check_above(-1, self, "wrong")
-        if self.wrong == 0:
-            raise ConfigError("wrong: 0 is no error; give one above -1 that is not 0, such as 0.1")
+    seeds: Count = 20
+    baselines: tuple[Positive, ...] = (0.1, 0.4, 1.5, 3.0)
+    depths: tuple[Annotated[float, Ge(NEAREST_M)], ...] = (5.0, 10.0, 20.0, 50.0, 100.0)
+    targets: Count = 100
+    wrong: Annotated[float, Gt(-1)] = 0.1
+    scatter: Positive = 0.1
+    noise_px: Positive = 0.5
 
 
-def one(_: None, settings: DepthSettings, seed: int) -> list[Row]:
+def one(settings: DepthSettings, seed: int) -> list[Row]:
     """Draw a rig of each baseline; give a row per depth and cause."""
     return [row for i in range(len(settings.baselines)) for row in _of_rig(settings, seed, i)]
 
@@ -160,11 +148,9 @@ def measured_depths(
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Give medians over the seeds by cause, depth and baseline, and the agreement with first order."""
     summary: dict[str, Any] = {}
-    for cause in dict.fromkeys(row["cause"] for row in rows):
-        mine = [row for row in rows if row["cause"] == cause]
+    for cause, mine in grouped(rows, "cause").items():
         cells: dict[str, dict[str, float]] = {}
-        for depth, baseline in dict.fromkeys((row["depth_m"], row["baseline_m"]) for row in mine):
-            found = [row for row in mine if (row["depth_m"], row["baseline_m"]) == (depth, baseline)]
+        for (depth, baseline), found in grouped(mine, "depth_m", "baseline_m").items():
             keys = ("relative", "reached_deg", "first_order_deg", "width")
             cells[cell_name(depth, baseline)] = {key: float(np.median([row[key] for row in found])) for key in keys}
         ratio = [row["reached_deg"] / row["first_order_deg"] for row in mine]
@@ -185,27 +171,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def describe(settings: DepthSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per cause, depth and baseline, and the agreement with first order."""
-    lines = [
-        [f"{cause}, {cell}", 100 * v["relative"], v["reached_deg"], v["first_order_deg"], 100 * v["width"]]
-        for cause, found in summary.items()
-        for cell, v in found["cells"].items()
-    ]
-    ratios = (
-        f"{cause}: {r['median']:.3f} ({r['low']:.3f} to {r['high']:.3f})"
-        for cause, found in summary.items()
-        if (r := found["over_first_order"])
-    )
-    return "\n".join(
-        [
-            f"from errors of the depth, medians over {seeds_of(settings)}; % of width: median over the targets",
-            table(("cause", "depth, rms %", "reached [deg]", "first order [deg]", "% of width"), lines),
-            "Monte Carlo over first order, median and 5 to 95 %: " + "; ".join(ratios),
-        ]
-    )
-
-
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Errors over depth and over baseline: Monte Carlo with quartiles over the seeds, first order as lines."""
     figure.set_size_inches(13, 4.8)
@@ -220,12 +185,10 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     for ax, x_key, held, value, y_key, label in panels:
         for i, cause in enumerate(CAUSES):
             mine = [row for row in rows if row["cause"] == cause and row[held] == value]
-            xs = sorted({row[x_key] for row in mine})
-            found = [[row for row in mine if row[x_key] == x] for x in xs]
-            low, mid, high = np.array([np.percentile([r[y_key] for r in f], [25, 50, 75]) for f in found]).T
-            ax.errorbar(xs, mid, [mid - low, high - mid], fmt="o", ms=4, capsize=2, color=f"C{i}", label=cause)
+            xs = quartiles(ax, mine, x_key, y_key, color=f"C{i}", label=cause)
             if y_key == "reached_deg":
-                ax.plot(xs, [np.median([r["first_order_deg"] for r in f]) for f in found], color=f"C{i}", lw=1)
+                first_order = [[row["first_order_deg"] for row in mine if row[x_key] == x] for x in xs]
+                ax.plot(xs, np.median(first_order, axis=1), color=f"C{i}", lw=1)
         named = "baseline" if held == "baseline_m" else "depth"
         ax.set(
             xscale="log", yscale="log", xlabel=x_key.replace("_m", " [m]"), ylabel=label, title=f"{named} {value:g} m"
@@ -239,17 +202,5 @@ def _nearest(rows: Sequence[Row], key: str, wanted: float) -> float:
 
 
 SETTINGS = DepthSettings()
-EXPERIMENT = Experiment(
-    "depth_error",
-    "How an error of the depth becomes a pointing error, over depth and baseline.",
-    SETTINGS,
-    replace(SETTINGS, seeds=2, baselines=(0.4, 1.5), depths=(5.0, 20.0, 50.0), targets=50),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    cost_s=3.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=2, baselines=(0.4, 1.5), depths=(5.0, 20.0, 50.0), targets=50)
+COST_S = 3.0

@@ -6,37 +6,33 @@ tracked. Ground truth judges the tracks: the fraction of time that a wholly visi
 tracks a minute, and switches of a track to another target. The shaking camera's frames are those of the static one,
 shifted by random offsets with a correlation time of a tenth of a second; its tracks are judged after the shift is
 removed. Without targets, the camera is static.
-
-    python -m experiments.following.detectors [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
+from annotated_types import Gt, Le
 
 from cotarget.config import DetectorName, RigConfig, TargetProfile
-from cotarget.detection import make_detector
+from cotarget.detection import Detector, make_detector
 from cotarget.evaluation import off_target, on_target
 from cotarget.geometry import Array
 from cotarget.metrics import BACKGROUND_S, WHOLLY_VISIBLE, false_tracks, id_switches
 from cotarget.rig import Frame
+from cotarget.schema import NotNegative
 from cotarget.sim.targets.random_paths import GROUPED, SECONDS
 from cotarget.sim.truth import Silhouette
 from cotarget.sim.world import SimWorld
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
-from experiments.engine.checks import check_above, check_ways
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.spread import in_words, points, spread
-from experiments.engine.texts import table
+from experiments.engine import Count, Row, Settings
 from experiments.following.field_scenes import field_config, five_targets_config
 from experiments.following.wide_view import WIDE
+from experiments.tables import grouped, spread
 
 DETECTORS: tuple[DetectorName, ...] = ("mog2", "motion", "speck")
 STANDS, SHAKES = "stands", "shakes"
@@ -61,17 +57,11 @@ class DetectorsSettings(Settings):
         shake_px: standard deviation of the image's shift along each axis [px].
     """
 
-    seeds: int = 2
-    seconds: float = SECONDS
+    seeds: Count = 2
+    seconds: Annotated[float, Gt(COME_S), Le(SECONDS)] = SECONDS
     kinds: tuple[str, ...] = GROUPED
     detectors: tuple[DetectorName, ...] = DETECTORS
-    shake_px: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_above(COME_S, self, "seconds")
-        check_ways(self, "seconds")
+    shake_px: NotNegative = 1.0
 
 
 @dataclass
@@ -84,6 +74,7 @@ class Watch:
         camera: STANDS or SHAKES.
         target: configuration of the target.
         config: configuration of the rig.
+        detector: searches the frames; by default one of that name.
         on: pairs of track and target that match, per frame.
         off: time [s] and tracks on no target, per frame.
         found: for each wholly visible target in each frame, whether a track was on it.
@@ -94,12 +85,13 @@ class Watch:
     camera: str
     target: TargetProfile
     config: RigConfig
+    detector: Detector | None = None
     on: list[list[tuple[int, str]]] = field(default_factory=list)
     off: list[tuple[float, list[int]]] = field(default_factory=list)
     found: list[bool] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._detector = make_detector(self.target, self.config.sim.fixed.rate_hz)
+        self._detector = self.detector or make_detector(self.target, self.config.sim.fixed.rate_hz)
         self._tracker = Tracker(tracking_settings(self.target), self.config.sim.fixed.size)
 
     def see(self, frame: Frame, shift: Array, outlines: Mapping[str, Silhouette | None]) -> None:
@@ -128,7 +120,7 @@ class Watch:
         }
 
 
-def one(_: None, settings: DetectorsSettings, seed: int) -> list[Row]:
+def one(settings: DetectorsSettings, seed: int) -> list[Row]:
     """Run each scene once with all detectors; give a row per detector and camera."""
     rows = [row for kind in settings.kinds for row in watched(five_targets_config(seed, kind), (kind,), settings, seed)]
     return [*rows, *watched(field_config({}, seed), settings.kinds, settings, seed)]
@@ -143,13 +135,13 @@ def watched(config: RigConfig, kinds: Sequence[str], settings: DetectorsSettings
         for camera in ((STANDS, SHAKES) if config.sim.targets else (STANDS,))
     ]
     world = SimWorld(config, rendered=WIDE)
-    truth, shake = world.truth(), _Shake(settings.shake_px, np.random.default_rng((seed, STREAM)))
+    truth, shake = world.truth(), Shake(settings.shake_px, np.random.default_rng((seed, STREAM)))
     with world.rig as rig:
         t: float | None = None
         while t is None or t < settings.seconds:
             frame = rig.fixed.read(newer_than=t)
             shift = shake.at(frame.t)
-            shaken = Frame(_shifted(frame.image, shift), frame.t)
+            shaken = Frame(shifted(frame.image, shift), frame.t)
             outlines = {name: truth.silhouette(name, "fixed", frame.t) for name in truth.targets}
             for watch in watches:
                 stands = watch.camera == STANDS
@@ -158,7 +150,7 @@ def watched(config: RigConfig, kinds: Sequence[str], settings: DetectorsSettings
     return (watch.row(seed) for watch in watches)
 
 
-class _Shake:
+class Shake:
     """Random shift of an image: Gaussian, with an exponential correlation."""
 
     def __init__(self, sigma_px: float, rng: np.random.Generator) -> None:
@@ -173,7 +165,7 @@ class _Shake:
         return self._at
 
 
-def _shifted(image: Any, shift: Array) -> Any:
+def shifted(image: Any, shift: Array) -> Any:
     """Shift an image by (du, dv) [px]."""
     M = np.column_stack([np.eye(2), shift])
     return cv2.warpAffine(image, M, image.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -181,60 +173,20 @@ def _shifted(image: Any, shift: Array) -> Any:
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
     """Give median, least and largest over the seeds for each scene, detector with camera, and figure."""
-    found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
-    for scene, way in dict.fromkeys((row["scene"], _way(row)) for row in rows):
-        mine = [row for row in rows if (row["scene"], _way(row)) == (scene, way)]
-        told = [key for key in FIGURES if mine[0][key] is not None]
-        found.setdefault(scene, {})[way] = {key: spread(mine, key) for key in told}
-    return found
+    return {
+        scene: {
+            way: {key: spread(row[key] for row in mine) for key in FIGURES if mine[0][key] is not None}
+            for way, mine in _ways(of_scene).items()
+        }
+        for scene, of_scene in grouped(rows, "scene").items()
+    }
 
 
-def _way(row: Row) -> str:
-    return f"{row['detector']}, {row['camera']}"
-
-
-def describe(settings: DetectorsSettings, summary: Mapping[str, Any]) -> str:
-    """Format a table per figure: a line per scene, a column per detector and camera."""
-    texts = [
-        f"median (least to largest) of {seeds_of(settings)}, {settings.seconds:g} s each; the camera stands, or shakes "
-        f"by {settings.shake_px:g} px along each axis, one standard deviation"
-    ]
-    for key, words in FIGURES.items():
-        scenes = {name: found for name, found in summary.items() if key in next(iter(found.values()))}
-        ways = list(dict.fromkeys(way for found in scenes.values() for way in found))
-        lines = (
-            [name, *(in_words(found[way][key]) if way in found else "" for way in ways)]
-            for name, found in scenes.items()
-        )
-        texts.append(table((words, *ways), lines))
-    return "\n\n".join(texts)
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """A panel for each figure, a group for each scene: medians with bars from the least seed to the largest."""
-    scenes, ways = (list(dict.fromkeys(map(what, rows))) for what in (lambda row: row["scene"], _way))
-    figure.set_size_inches(14, 4.2)
-    for ax, (key, words) in zip(figure.subplots(1, len(FIGURES)), FIGURES.items(), strict=True):
-        shown = [scene for scene in scenes if any(row[key] is not None for row in rows if row["scene"] == scene)]
-        for i, way in enumerate(ways):
-            for k, scene in enumerate(shown):
-                mine = [row[key] for row in rows if (row["scene"], _way(row)) == (scene, way)]
-                points(ax, k + 0.8 * (i / len(ways) - 0.4), mine, color=f"C{i}", label=way if k == 0 else None)
-        ax.set(title=words, xticks=range(len(shown)), xticklabels=shown, ylim=(0, None))
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
+def _ways(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Group rows by detector and camera."""
+    return {", ".join(way): mine for way, mine in grouped(rows, "detector", "camera").items()}
 
 
 SETTINGS = DetectorsSettings()
-EXPERIMENT = Experiment(
-    "detectors",
-    "What each detector finds in the field, and what it takes for a target, by a camera that stands or shakes.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, kinds=("bird",), detectors=("speck",)),
-    one,
-    summarise,
-    describe,
-    plot,
-    cost_s=240.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, kinds=("bird",), detectors=("speck",))
+COST_S = 240.0

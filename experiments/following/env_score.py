@@ -3,26 +3,21 @@
 In `cotarget/Follow-v0` the score is the fraction of an episode's frames with a good close-up: reward over steps. In
 `cotarget/Schedule-v0` it is an episode's reward, and the number of the five targets that were served. Random actions
 are drawn independently; a slot is drawn among those that are not empty.
-
-    python -m experiments.following.env_score [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
-from matplotlib.figure import Figure
+from annotated_types import Gt, Le
 
 from cotarget.control.selection import POLICIES
 from cotarget.env import FOLLOW, SCHEDULE, PipelinePolicy, SchedulingPolicy
 from cotarget.sim.targets.random_paths import GROUPED, LONE, SECONDS
-from experiments.engine.checks import check_above, check_ways
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.spread import bars, mean_of
-from experiments.engine.texts import table
+from experiments.engine import Count, Row, Settings
+from experiments.tables import mean_of
 
 CHANCE, PIPELINE = "chance", "pipeline"
 SERVED = ", served"  # suffix of a figure's name: number of targets served, beside the reward
@@ -37,17 +32,11 @@ class ScoreSettings(Settings):
         seconds: length of an episode [s].
     """
 
-    seeds: int = 5
-    seconds: float = SECONDS
-
-    def __post_init__(self) -> None:
-        """Refuse values that the environments refuse."""
-        super().__post_init__()
-        check_above(0, self, "seconds")
-        check_ways(self, "seconds")
+    seeds: Count = 5
+    seconds: Annotated[float, Gt(0), Le(SECONDS)] = SECONDS
 
 
-def one(shared: None, settings: ScoreSettings, seed: int) -> list[Row]:
+def one(settings: ScoreSettings, seed: int) -> list[Row]:
     """Run all episodes of a seed; give a row per episode."""
     rows = []
     for target in LONE:
@@ -118,51 +107,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     return [name for name, found in means.items() if found[CHANCE] >= max(v for k, v in found.items() if k != CHANCE)]
 
 
-def describe(settings: ScoreSettings, summary: Mapping[str, Any]) -> str:
-    """Format a table per environment."""
-    texts = [f"means with standard errors of {seeds_of(settings)}, {settings.seconds:g} s each"]
-    for env in (FOLLOW, SCHEDULE):
-        own = {name: found for name, found in summary.items() if name.startswith(env)}
-        lines = (
-            [name.removeprefix(env).strip(), *("{mean:.3g} +- {error:.2g}".format(**each) for each in found.values())]
-            for name, found in own.items()
-        )
-        texts.append(table((env, *next(iter(own.values()))), lines))
-    return "\n\n".join(texts)
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Each policy a bar: means with standard errors, a point a seed."""
-    found = figures_of(rows)
-    panels = {
-        (FOLLOW, "reward a step"): [name for name in found if name.startswith(FOLLOW)],
-        (SCHEDULE, "reward"): [name for name in found if name.startswith(SCHEDULE) and not name.endswith(SERVED)],
-        (SCHEDULE, "targets served"): [name for name in found if name.endswith(SERVED)],
-    }
-    figure.set_size_inches(12, 4.2)
-    for ax, ((env, label), names) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
-        policies = list(found[names[0]])
-        for i, policy in enumerate(policies):
-            at = [place + 0.8 * (i - (len(policies) - 1) / 2) / len(policies) for place in range(len(names))]
-            bars(ax, at, [found[name][policy] for name in names], 0.7 / len(policies), label=policy)
-        targets = [name.removeprefix(env).removesuffix(SERVED).strip() for name in names]
-        ax.set(title=env, ylabel=label, xticks=range(len(names)), xticklabels=targets)
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2, frameon=False)
-
-
 SETTINGS = ScoreSettings()
-EXPERIMENT = Experiment(
-    "env_score",
-    "What the pipeline earns in the environments, and what chance earns.",
-    SETTINGS,
-    replace(SETTINGS, seeds=1, seconds=8.0),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    cost_s=60.0,
-    bounded=bounded,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=1, seconds=8.0)
+COST_S = 60.0

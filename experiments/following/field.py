@@ -8,6 +8,9 @@ import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
+
+from annotated_types import Gt, Le
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.calibrate import calibrate
@@ -22,38 +25,23 @@ from cotarget.safety.safe_rig import guard
 from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
-from experiments.engine import harness
-from experiments.engine.checks import check_above, check_ways
+from experiments.engine import Settings
 from experiments.following.own_rig import OwnRig, RigText
 from experiments.following.wide_view import WideView, open_on
 from experiments.paper.paper_loop import Follow
 
 
 @dataclass(frozen=True)
-class FieldSettings(harness.Settings):
+class FieldSettings(Settings):
     """Settings of runs in the field: their length, and whether the rig is calibrated.
 
     Attributes:
-        seconds: length of each run [s].
+        seconds: length of each run, from the start of the clock to the end of the targets' paths [s].
         calibrated: whether the rig is calibrated from rendered boards; otherwise it is known exactly.
-
-    Raises:
-        ConfigError: a run ends before the clock starts, or after the targets' paths end.
     """
 
-    seconds: float = SECONDS
+    seconds: Annotated[float, Gt(BACKGROUND_S), Le(SECONDS)] = SECONDS
     calibrated: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        starts_s, ends_s = self.lasting_s
-        check_above(starts_s, self, "seconds")
-        check_ways(self, "seconds", end_s=ends_s)
-
-    @property
-    def lasting_s(self) -> tuple[float, float]:
-        """Limits of a run's length [s]: the start of the clock, and the end of the targets' paths."""
-        return BACKGROUND_S, SECONDS
 
 
 @dataclass(frozen=True)
@@ -61,9 +49,10 @@ class OwnRigInField(OwnRig, FieldSettings):
     """Settings of runs in the field for an experiment that accepts a user's own rig."""
 
 
-def _of_calibration(settings: FieldSettings) -> tuple[bool, int, RigText]:
+def calibrated(settings: FieldSettings) -> Calibration:
+    """Calibrate the settings' rig, from rendered boards or exactly, once in a process."""
     rig = settings.text if isinstance(settings, OwnRig) else RigText()
-    return settings.calibrated, settings.seed_base, rig
+    return _calibrated(settings.calibrated, settings.seed_base, rig)
 
 
 @functools.cache
@@ -74,10 +63,6 @@ def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
     world = SimWorld(config)
     with guard(world.rig, config.safety) as safe:
         return calibrate(safe, config.board, seed=config.sim.seed)
-
-
-# Calibration of a rig, from rendered boards or exact; shared by all experiments in the field with that rig.
-calibrated = harness.Preparation(_calibrated, _of_calibration)
 
 
 def held(

@@ -7,28 +7,25 @@ square of the errors that each cause leaves alone: detection, size, calibration,
 positions. A shot at something else than the target counts as a miss and is left out of the budget. A shot that is
 skipped, because the target is not detected or out of reach, is counted separately; a correction that could not be fired
 counts as a miss.
-
-    python -m experiments.following.first_shot [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
 import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Gt, Le
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cotarget.calibration import Calibration
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.spread import BESIDE, in_words, spread_of
-from experiments.engine.texts import rms, table
+from cotarget.sim.targets.random_paths import SECONDS
+from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated, target_of
 from experiments.following.field_scenes import LATENCY_S, hold_config
 from experiments.following.shots import BEGIN_S, CAUSES, Fired, fire
+from experiments.tables import BESIDE, grouped, outside, rms, spread
 
 # Goals for each target: least and largest value.
 WANTED: Mapping[str, tuple[float, float]] = {
@@ -48,24 +45,18 @@ class FirstShotSettings(FieldSettings):
         targets: book, person or bird.
     """
 
-    seeds: int = 2
+    seeds: Count = 2
+    # The first shot uses the fixed camera's frame of BEGIN_S, which arrives LATENCY_S later.
+    seconds: Annotated[float, Gt(BEGIN_S + LATENCY_S), Le(SECONDS)] = SECONDS
     targets: tuple[str, ...] = ("book", "person", "bird")
 
-    @property
-    def lasting_s(self) -> tuple[float, float]:
-        """Limits of a run's length [s].
 
-        The first shot uses the fixed-camera frame of BEGIN_S, which arrives LATENCY_S later.
-        """
-        return BEGIN_S + LATENCY_S, super().lasting_s[1]
-
-
-def one(calibration: Calibration, settings: FirstShotSettings, seed: int) -> list[Row]:
+def one(settings: FirstShotSettings, seed: int) -> list[Row]:
     """Shoot at each target; give a row per due shot."""
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
-        fired = fire(calibration, config, name, target_of(config, name), settings.seconds)
+        fired = fire(calibrated(settings), config, name, target_of(config, name), settings.seconds)
         rows += [{"seed": seed, "target": name, "fired": each is not None} | _row(each) for each in fired]
     return rows
 
@@ -98,13 +89,9 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     The figures of each seed's shots alone are added, from least to largest.
     """
     found: dict[str, dict[str, Any]] = {}
-    for name in dict.fromkeys(row["target"] for row in rows):
-        mine = [row for row in rows if row["target"] == name]
-        seeds = [
-            _figures([row for row in mine if row["seed"] == seed])
-            for seed in dict.fromkeys(row["seed"] for row in mine)
-        ]
-        by_seed = {key: spread_of(seed[key] for seed in seeds if not math.isnan(seed[key])) for key in seeds[0]}
+    for name, mine in grouped(rows, "target").items():
+        seeds = [_figures(of_seed) for of_seed in grouped(mine, "seed").values()]
+        by_seed = {key: spread(seed[key] for seed in seeds if not math.isnan(seed[key])) for key in seeds[0]}
         found[name] = {**_figures(mine), SEEDS: by_seed}
     return found
 
@@ -136,27 +123,7 @@ def _of(mean: Callable[[Sequence[float]], Any], values: Sequence[float]) -> floa
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List the figures that miss their goal."""
-    return [
-        f"{name}: {key}"
-        for name, figures in summary.items()
-        for key, (low, high) in WANTED.items()
-        if not low <= figures[key] <= high
-    ]
-
-
-def describe(settings: FirstShotSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per figure, a column per target."""
-    keys = [key for key in next(iter(summary.values()), {}) if key != SEEDS]
-    lines = [
-        [
-            f"{key}, rms" if key in (*CAUSES, "sum", "measured") else key,
-            *(in_words(figures[SEEDS][key] | {"median": figures[key]}) for figures in summary.values()),
-            "{:g}-{:g}".format(*WANTED[key]) if key in WANTED else "",
-        ]
-        for key in keys
-    ]
-    what = f"single shots, offsets over the width, of all (least to largest of one seed's), {seeds_of(settings)}"
-    return f"{what}\n{table(('', *summary, 'wanted'), lines)}"
+    return [text for name, figures in summary.items() for text in outside(figures, WANTED, name)]
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
@@ -165,8 +132,8 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     shown = (*CAUSES, "sum", "measured")
     for i, (name, figures) in enumerate(summarise(rows).items()):
         mine, how = [row for row in rows if row["target"] == name and row["fired"]], {"color": f"C{i}"}
-        for seed in dict.fromkeys(row["seed"] for row in mine):
-            _draw(left, [row for row in mine if row["seed"] == seed], "tpo_width", lw=0.4, alpha=0.6, **how)
+        for of_seed in grouped(mine, "seed").values():
+            _draw(left, of_seed, "tpo_width", lw=0.4, alpha=0.6, **how)
         _draw(left, mine, "tpo_width", label=name, **how)
         _draw(left, mine, "corrected_width", ls="--", label=f"{name}, corrected", **how)
         middle = [figures[key] for key in shown]
@@ -188,19 +155,6 @@ def _draw(ax: Axes, shots: Sequence[Row], key: str, **how: Any) -> None:
 
 
 SETTINGS = FirstShotSettings()
-EXPERIMENT = Experiment(
-    "first_shot",
-    "How well a single shot from the fixed camera alone hits, and what a miss consists of.",
-    SETTINGS,
-    # Nine shots each. A bird's correction is bounded by the value reached, which misses the goal in the full run too.
-    dataclasses.replace(SETTINGS, seeds=1, targets=("book", "bird"), seconds=10.0, calibrated=False),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    prepare=calibrated,
-    cost_s=120.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+# Nine shots each. A bird's correction is bounded by the value reached, which misses the goal in the full run too.
+QUICK = dataclasses.replace(SETTINGS, seeds=1, targets=("book", "bird"), seconds=10.0, calibrated=False)
+COST_S = 120.0

@@ -4,13 +4,10 @@ Five persons or five birds cross the fixed view in the field of `experiments.fol
 once. A target is served when it was well in the close-up, as defined by the metrics, for a second in total. The fixed
 view is rendered and searched once for each seed and kind, and followed under each policy, by default without correction
 from the zoom view (`--set five_targets.closed_loop=true`).
-
-    python -m experiments.following.five_targets [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,12 +23,11 @@ from cotarget.metrics import SERVED_S
 from cotarget.pipeline import FollowSettings
 from cotarget.sim.targets.random_paths import GROUP
 from cotarget.sim.truth import Truth
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.spread import BESIDE
-from experiments.engine.texts import table
+from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated, target_of, watched
 from experiments.following.field_scenes import five_targets_config
 from experiments.following.wide_view import WideView, record
+from experiments.tables import BESIDE, grouped
 
 FIRST = "first-come"
 WANTED = 1.5  # goal: targets served by the best policy over those by first-come
@@ -46,12 +42,12 @@ class FiveSettings(FieldSettings):
         closed_loop: whether the zoom view corrects the aim.
     """
 
-    seeds: int = 2
+    seeds: Count = 2
     kinds: tuple[str, ...] = ("person", "bird")
     closed_loop: bool = False
 
 
-def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row]:
+def one(settings: FiveSettings, seed: int) -> list[Row]:
     """Follow five of each kind under each policy; give a row per policy."""
     rows: list[Row] = []
     for kind in settings.kinds:
@@ -60,7 +56,7 @@ def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row
         view = record(config, target, settings.seconds)
         for policy, make in POLICIES.items():
             how = FollowSettings(closed_loop=settings.closed_loop)
-            seconds = good_seconds(calibration, config, target, settings.seconds, how, view, make())
+            seconds = good_seconds(calibrated(settings), config, target, settings.seconds, how, view, make())
             rows.append(
                 {
                     "seed": seed,
@@ -106,11 +102,8 @@ def _near(truth: Truth, name: str, t: float) -> bool:
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """Give targets served by policy (mean, least and most over the seeds), and the best mean over first-come's."""
     found: dict[str, dict[str, Any]] = {}
-    for kind in dict.fromkeys(row["kind"] for row in rows):
-        served = {
-            policy: _of([row["served"] for row in rows if (row["kind"], row["policy"]) == (kind, policy)])
-            for policy in POLICIES
-        }
+    for kind, mine in grouped(rows, "kind").items():
+        served = {policy: _of([row["served"] for row in each]) for policy, each in grouped(mine, "policy").items()}
         best, first = max(each["mean"] for each in served.values()), served[FIRST]["mean"]
         found[kind] = served | {"best over first": best / first if first else math.inf * best}
     return found
@@ -125,30 +118,12 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     return [kind for kind, found in summary.items() if not found["best over first"] >= WANTED]
 
 
-def describe(settings: FiveSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per kind."""
-    head = ("", *POLICIES, "best / first-come", "wanted")
-    lines = [
-        [
-            f"five {kind}s",
-            *("{mean:.3g} ({least:g} to {most:g})".format(**found[policy]) for policy in POLICIES),
-            found["best over first"],
-            f">= {WANTED:g}",
-        ]
-        for kind, found in summary.items()
-    ]
-    return (
-        f"targets of five with {SERVED_S:g} s of good close-up or more, mean (least to most) of {seeds_of(settings)}, "
-        f"{settings.seconds:g} s each\n" + table(head, lines)
-    )
-
-
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """How many were served under each policy: the mean, with bars from the least seed to the most, and each seed."""
-    kinds = list(dict.fromkeys(row["kind"] for row in rows))
-    for ax, kind in zip(np.ravel(figure.subplots(1, len(kinds), sharey=True)), kinds, strict=True):
-        for i, policy in enumerate(POLICIES):
-            served = [row["served"] for row in rows if (row["kind"], row["policy"]) == (kind, policy)]
+    kinds = grouped(rows, "kind")
+    for ax, (kind, mine) in zip(np.ravel(figure.subplots(1, len(kinds), sharey=True)), kinds.items(), strict=True):
+        for i, each in enumerate(grouped(mine, "policy").values()):
+            served = [row["served"] for row in each]
             mean = float(np.mean(served))
             ax.bar(i, mean, 0.6, yerr=[[mean - min(served)], [max(served) - mean]], capsize=4, alpha=0.6)
             ax.plot(i + np.linspace(-BESIDE, BESIDE, len(served)), served, "k.")
@@ -157,18 +132,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = FiveSettings()
-EXPERIMENT = Experiment(
-    "five_targets",
-    "Of five targets at once, how many get a good close-up under each policy.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, kinds=("person",), seconds=12.0, calibrated=False),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    prepare=calibrated,
-    cost_s=250.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = dataclasses.replace(SETTINGS, seeds=1, kinds=("person",), seconds=12.0, calibrated=False)
+COST_S = 250.0

@@ -5,27 +5,21 @@ The rig is the default one, calibrated from rendered boards, under the field's c
 motion, and true sizes that differ from the nominal ones. Each seed has another path, size and noise. Figures are
 medians over the seeds with the least and the largest, as defined in `cotarget.metrics`. Ground truth judges every
 frame; the pipeline has no access to it.
-
-    python -m experiments.following.hold [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from cotarget.calibration import Calibration
 from cotarget.metrics import score
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.spread import in_words, points, spread_of
-from experiments.engine.texts import table
+from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated, held
 from experiments.following.field_scenes import hold_config
+from experiments.tables import grouped, outside, points, spread
 
 # Goals for each figure's median: least and largest value.
 WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -74,17 +68,17 @@ class HoldSettings(FieldSettings):
         targets: book, person or bird.
     """
 
-    seeds: int = 2
+    seeds: Count = 2
     targets: tuple[str, ...] = tuple(WANTED)
 
 
-def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row]:
+def one(settings: HoldSettings, seed: int) -> list[Row]:
     """Follow each target once; give a row per target."""
     return [
         {
             "seed": seed,
             "target": name,
-            **dataclasses.asdict(score(held(calibration, hold_config(name, seed), name, settings.seconds))),
+            **dataclasses.asdict(score(held(calibrated(settings), hold_config(name, seed), name, settings.seconds))),
         }
         for name in settings.targets
     ]
@@ -93,69 +87,33 @@ def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """Give median, least and largest of each target's figures over the seeds."""
     return {
-        name: {key: _spread(key, [row[key] for row in rows if row["target"] == name]) for key in (*wanted, *ALSO)}
-        for name, wanted in WANTED.items()
-        if any(row["target"] == name for row in rows)
+        name: {key: _spread(key, [row[key] for row in mine]) for key in (*WANTED[name], *ALSO)}
+        for name, mine in grouped(rows, "target").items()
     }
 
 
 def _spread(key: str, values: Sequence[float | None]) -> dict[str, float]:
     """Summarise a figure; a run without it counts as the worst in the median, and makes the others nan."""
     worst = 0.0 if key in SHARES else math.inf
-    found = spread_of(worst if value is None else float(value) for value in values)
+    found = spread(worst if value is None else float(value) for value in values)
     return found if None not in values else {**dict.fromkeys(found, math.nan), "median": found["median"]}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List the figures that miss their goal."""
-    return [
-        f"{name}: {key}"
-        for name, figures in summary.items()
-        for key, (low, high) in WANTED[name].items()
-        if not low <= figures[key]["median"] <= high
-    ]
-
-
-def describe(settings: HoldSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per figure, with a column and the goal per target."""
-    lines = []
-    for key in (*WANTED["book"], *ALSO):
-        cells: list[Any] = [key]
-        for name, figures in summary.items():
-            low, high = WANTED[name].get(key, (-np.inf, np.inf))
-            mark = "" if low <= figures[key]["median"] <= high else " NO"
-            cells += [in_words(figures[key]) + mark, f"{low:g}-{high:g}" if key in WANTED[name] else ""]
-        lines.append(cells)
-    head = ["median (least to largest)", *(column for name in summary for column in (name, "wanted"))]
-    return f"holding a target, {seeds_of(settings)}\n" + table(head, lines)
+    return [text for name, figures in summary.items() for text in outside(figures, WANTED[name], name)]
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Close-up yield and offset by target: medians with bars from the least seed to the largest, a point a seed."""
-    names = [name for name in WANTED if any(row["target"] == name for row in rows)]
-    for ax, (key, label) in zip(
-        figure.subplots(1, 2),
-        (("closeup_yield", "close-up yield"), ("tpo_width_median", "median offset / width")),
-        strict=True,
-    ):
-        for i, name in enumerate(names):
-            points(ax, i, [row[key] for row in rows if row["target"] == name and row[key] is not None], color=f"C{i}")
-        ax.set(ylabel=label, xticks=range(len(names)), xticklabels=names)
+    targets = grouped(rows, "target")
+    labels = {"closeup_yield": "close-up yield", "tpo_width_median": "median offset / width"}
+    for ax, (key, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
+        for i, mine in enumerate(targets.values()):
+            points(ax, i, [row[key] for row in mine], color=f"C{i}")
+        ax.set(ylabel=label, xticks=range(len(targets)), xticklabels=list(targets))
 
 
 SETTINGS = HoldSettings()
-EXPERIMENT = Experiment(
-    "hold",
-    "How long and how well a target is held in the close-up.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, calibrated=False),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    prepare=calibrated,
-    cost_s=150.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, calibrated=False)
+COST_S = 150.0

@@ -10,12 +10,9 @@ lens's range.
 There are two conditions. `exact`: pixel and depth without error and a head without steps, for the error of the models
 alone. `seen`: 0.5 px of noise in the pixel, 5 % in the depth, and head steps of 0.0514 degrees, the same for all
 models.
-
-    python -m experiments.following.models [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -27,15 +24,15 @@ from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_views
 from cotarget.config import BoardConfig, SimHead
 from cotarget.geometry import Array
+from cotarget.schema import Positive
 from experiments.calibration.synthetic.aims import looking_off
 from experiments.calibration.synthetic.rig import SIZE, SIZES
-from experiments.calibration.synthetic.views import Placing, spread_views
-from experiments.engine.checks import check_above, check_session
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.calibration.synthetic.views import Boards, Looks, Placing, spread_views
+from experiments.engine import Count, Row, Settings
 from experiments.following.mounted import MOUNTED_DEG, at, cell_name, mounted, off_px, wanted_focal_px
 from experiments.following.regimes import FACTOR, ratios, reach, regime
 from experiments.following.simpler import CENTRING, FULL, IGNORED, MODELS, TABLE, TURNED, ZEROED, models_of
+from experiments.tables import as_text, grouped, quartiles, rms
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,27 +62,20 @@ class ModelsSettings(Settings):
         zero_depth: depth of the target on which pan and tilt are set [m].
     """
 
-    seeds: int = 10
-    baselines: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)
-    depths: tuple[float, ...] = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
-    targets: int = 60
-    mounted_deg: float = MOUNTED_DEG
-    boards: int = 12
-    looks: int = 4
-    corner_px: float = 0.2
-    pixel_px: float = 0.5
-    depth_error: float = 0.05
-    zero_depth: float = CENTRING.zero_depth
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_above(0, self, "baselines", "depths", "targets", "boards", "looks")
-        check_above(0, self, "mounted_deg", "corner_px", "pixel_px", "depth_error", "zero_depth")
-        check_session(self, "boards", "looks")
+    seeds: Count = 10
+    baselines: tuple[Positive, ...] = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)
+    depths: tuple[Positive, ...] = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
+    targets: Count = 60
+    mounted_deg: Positive = MOUNTED_DEG
+    boards: Boards = 12
+    looks: Looks = 4
+    corner_px: Positive = 0.2
+    pixel_px: Positive = 0.5
+    depth_error: Positive = 0.05
+    zero_depth: Positive = CENTRING.zero_depth
 
 
-def one(_: None, settings: ModelsSettings, seed: int) -> list[Row]:
+def one(settings: ModelsSettings, seed: int) -> list[Row]:
     """Draw a rig of each baseline; give a row per depth and model."""
     return [row for i in range(len(settings.baselines)) for row in _of_rig(settings, seed, i)]
 
@@ -130,11 +120,10 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     summary: dict[str, Any] = {}
     for condition in CONDITIONS:
         cells: dict[str, dict[str, dict[str, float]]] = {}
-        for depth, baseline in dict.fromkeys((row["depth_m"], row["baseline_m"]) for row in rows):
-            mine = [row for row in rows if (row["depth_m"], row["baseline_m"]) == (depth, baseline)]
+        for (depth, baseline), mine in grouped(rows, "depth_m", "baseline_m").items():
             cells[cell_name(depth, baseline)] = {
-                name: {key: float(np.median(_of(mine, name, f"{condition}_{key}"))) for key in ("deg", "width")}
-                for name in MODELS
+                name: {key: float(np.median([row[f"{condition}_{key}"] for row in each])) for key in ("deg", "width")}
+                for name, each in grouped(mine, "model").items()
             }
         summary[condition] = {
             "errors": cells,
@@ -144,10 +133,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         }
     summary["of"] = {"seeds": len({row["seed"] for row in rows})}
     return summary
-
-
-def _of(rows: Sequence[Row], model: str, key: str) -> list[float]:
-    return [row[key] for row in rows if row["model"] == model]
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
@@ -170,37 +155,19 @@ def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def describe(settings: ModelsSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per model, a column per depth and baseline, in degrees and in % of the close-up's width."""
-    texts = []
-    for condition in CONDITIONS:
-        errors = summary[condition]["errors"]
-        cells = [cell for pair in SHOWN if (cell := cell_name(*pair)) in errors] or list(errors)[:3]
-        lines = [
-            [name, *(value for c in cells for value in (errors[c][name]["deg"], 100 * errors[c][name]["width"]))]
-            for name in MODELS
-        ]
-        head = [
-            "model",
-            *(text for cell in cells for text in (cell.replace("depth ", "").replace("baseline ", ""), "% width")),
-        ]
-        texts += [
-            f"{condition}: rms pointing error [degrees] and median offset in the close-up [% of its width]",
-            table(head, lines),
-        ]
-        for name in OPPONENTS:
-            found = summary[condition]["regime"][name]
-            off = "" if name == IGNORED else f" - 1 / {settings.zero_depth:g} m"
-            texts.append(
-                f"at least {FACTOR:g} times better than with the {name}: 1 / (baseline |1 / depth{off}|) of "
-                f"{found['from']:.3g} {_up_to(found['to'])}"
-            )
-    zeros = f"zeroed on a target at {settings.zero_depth:g} m"
-    return "\n".join([f"medians over {seeds_of(settings)}; {zeros}", *texts])
-
-
 def _up_to(reach: float) -> str:
     return "on" if math.isinf(reach) else f"to {reach:.4g}"
+
+
+def describe(settings: ModelsSettings, summary: Mapping[str, Any]) -> str:
+    """Format the errors at some depths and baselines, a line a model, and the regimes."""
+    found: dict[str, Any] = {"regime": {condition: summary[condition]["regime"] for condition in CONDITIONS}}
+    for condition in CONDITIONS:
+        errors = summary[condition]["errors"]
+        for cell in [cell for pair in SHOWN if (cell := cell_name(*pair)) in errors] or list(errors)[:3]:
+            for name, each in errors[cell].items():
+                found.setdefault(f"{condition}, {cell}", {})[name] = each["deg"]
+    return f"rms pointing error [degrees]; zeroed on a target at {settings.zero_depth:g} m\n" + as_text(found)
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
@@ -230,12 +197,8 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 def _over_depth(ax: "Axes", rows: Sequence[Row], key: str, number: int, **style: Any) -> None:
     """Plot one model's medians and quartiles over the seeds, shifted and thinner by its number."""
-    depths = sorted({row["depth_m"] for row in rows})
-    values = [[row[key] for row in rows if row["depth_m"] == depth] for depth in depths]
-    low, mid, high = np.array([np.percentile(v, [25, 50, 75]) for v in values]).T
-    dashes = "-" if number % 2 == 0 else "--"
-    aside = np.array(depths) * 1.03 ** (number - 3)
-    ax.errorbar(aside, mid, [mid - low, high - mid], fmt="o", ls=dashes, lw=3 - number / 3, ms=4, capsize=2, **style)
+    aside = [row | {"depth_m": row["depth_m"] * 1.03 ** (number - 3)} for row in rows]
+    quartiles(ax, aside, "depth_m", key, ls="-" if number % 2 == 0 else "--", lw=3 - number / 3, **style)
 
 
 def _regimes(ax: "Axes", rows: Sequence[Row], model: str) -> None:
@@ -258,18 +221,5 @@ def _regimes(ax: "Axes", rows: Sequence[Row], model: str) -> None:
 
 
 SETTINGS = ModelsSettings()
-EXPERIMENT = Experiment(
-    "models",
-    "What the models of the related work lose beside the full one, over depth and baseline.",
-    SETTINGS,
-    replace(SETTINGS, seeds=2, baselines=(0.4, 1.5), depths=(10.0, 50.0, 200.0), targets=20, boards=10),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    cost_s=10.0,
-    bounded=bounded,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=2, baselines=(0.4, 1.5), depths=(10.0, 50.0, 200.0), targets=20, boards=10)
+COST_S = 10.0

@@ -11,7 +11,7 @@ from pathlib import Path
 from cotarget.backends import load_config
 from cotarget.config import RigConfig, read_text
 from cotarget.errors import ConfigError
-from experiments.engine import harness
+from experiments.engine import Settings
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class RigText:
 
 
 @dataclass(frozen=True)
-class OwnRig(harness.Settings):
+class OwnRig(Settings):
     """Settings with an optional rig of the user's own.
 
     Attributes:
@@ -49,7 +49,6 @@ class OwnRig(harness.Settings):
     rig_toml: str = ""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         said = ""
         if self.rig:
             said = read_text(Path(self.rig))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cotarget.geometry import Array
-from experiments.engine.harness import Row
+from experiments.engine import Row
 from experiments.following.simpler import FULL, IGNORED
 
 FACTOR = 5.0  # factor by which the full model has to be better than "offset ignored" somewhere

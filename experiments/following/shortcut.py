@@ -10,30 +10,28 @@ Targets are at several depths, on a grid over the fixed image and in a disc abou
 angle between line of sight and target, also in pixels at the focal length that shows the paper's book of 0.234 m 160 px
 wide, within the lens's range: 7155 px at 10.5 m and beyond. Angles off the axis are from the zoom camera's axis at
 home.
-
-    python -m experiments.following.shortcut [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import numpy as np
+from annotated_types import Ge
 from matplotlib.figure import Figure, SubFigure
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.errors import UnreachableError
 from cotarget.geometry import Array, RigidTransform
+from cotarget.schema import Positive
 from cotarget.targeting import METHODS, Method, Reach, aim
 from experiments.calibration.synthetic.aims import looking_off
 from experiments.calibration.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Truth
-from experiments.engine.checks import check_above
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.engine import Count, Row, Settings
 from experiments.following.mounted import at, exact_calibration, idealised, mounted, off_px, wanted_focal_px
 from experiments.paper.worked_example import X_FIXED_MM, X_ZOOM0_MM, stand_in
+from experiments.tables import grouped, rms
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,21 +61,15 @@ class ShortcutSettings(Settings):
         rigs: kinds of rig, from RIGS.
     """
 
-    seeds: int = 20
-    baseline: float = 0.4
-    depths: tuple[float, ...] = (5.0, 10.0, 20.0, 50.0)
-    grid: tuple[int, int] = (13, 9)
-    near: int = 60
+    seeds: Count = 20
+    baseline: Positive = 0.4
+    depths: tuple[Positive, ...] = (5.0, 10.0, 20.0, 50.0)
+    grid: tuple[Annotated[int, Ge(2)], Annotated[int, Ge(2)]] = (13, 9)
+    near: Count = 60
     rigs: tuple[Literal["mounted", "Section 4.2"], ...] = ("mounted", "Section 4.2")
 
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_above(0, self, "baseline", "depths", "near")
-        check_above(1, self, "grid")
 
-
-def one(_: None, settings: ShortcutSettings, seed: int) -> list[Row]:
+def one(settings: ShortcutSettings, seed: int) -> list[Row]:
     """Draw a rig of each kind; give a row per target with the error of each method."""
     return [row for rig in settings.rigs for depth in settings.depths for row in _at_depth(settings, seed, rig, depth)]
 
@@ -105,7 +97,7 @@ def _at_depth(settings: ShortcutSettings, seed: int, rig: str, depth: float) -> 
     focal_px = wanted_focal_px(truth, x_fixed, BOOK.size, BOOK.wanted_px)
     errors = {}
     for method in METHODS:
-        q = np.array([_aimed(calibration, x, reach, method) for x in x_fixed])
+        q = np.array([aimed(calibration, x, reach, method) for x in x_fixed])
         errors[method] = looking_off(truth, x_fixed, q)
     return [
         {
@@ -130,7 +122,7 @@ def near_axis(truth: Truth, depth: float, count: int, rng: np.random.Generator) 
     return np.asarray(home.translation + rays * ((depth - home.translation[2]) / rays[:, 2])[:, None])
 
 
-def _aimed(calibration: Any, x_fixed: Array, reach: Reach, method: Method) -> tuple[float, float]:
+def aimed(calibration: Any, x_fixed: Array, reach: Reach, method: Method) -> tuple[float, float]:
     """Give pan and tilt [rad]; nan where the method has no solution."""
     try:
         found = aim(calibration, x_fixed, reach, method=method)
@@ -154,8 +146,8 @@ def px(row: Row, method: Method) -> float:
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Summarise by rig, method, region and depth: rms over a seed's targets, then median and quartiles."""
     summary: dict[str, Any] = {}
-    for rig in dict.fromkeys(row["rig"] for row in rows):
-        of_rig, found = [row for row in rows if row["rig"] == rig], summary.setdefault(rig, {})
+    for rig, of_rig in grouped(rows, "rig").items():
+        found = summary.setdefault(rig, {})
         for method in METHODS:
             unsolved = [not np.isfinite(row[f"{method}_deg"]) for row in of_rig]
             found[method] = {"unsolved": float(np.mean(unsolved))}
@@ -174,9 +166,7 @@ def _figures(rows: Sequence[Row], method: Method) -> dict[str, float]:
     """Compute the figures of a region; nan without targets, as on a coarse grid at 20 degrees."""
     if not rows:
         return dict.fromkeys(("deg", "deg_low", "deg_high", "worst_deg", "px"), math.nan)
-    seeds: dict[int, list[Row]] = {}
-    for row in rows:
-        seeds.setdefault(row["seed"], []).append(row)
+    seeds = grouped(rows, "seed")
     degrees = [rms(row[f"{method}_deg"] for row in mine) for mine in seeds.values()]
     pixels = [rms(px(row, method) for row in mine) for mine in seeds.values()]
     low, middle, high = np.nanpercentile(degrees, [25, 50, 75])
@@ -213,34 +203,6 @@ def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
         rig: {method: {name: found[method][name]["all"]["deg"] for name in REGIONS} for method in READINGS}
         for rig, found in summary.items()
     }
-
-
-def describe(settings: ShortcutSettings, summary: Mapping[str, Any]) -> str:
-    """Format a table with a line per rig, region and depth."""
-    head = ["where", *(text for name in NAMES.values() for text in (f"{name} [deg]", "px"))]
-    lines = [
-        [f"{rig}, {name}, {depth}", *(text for m in METHODS for text in _texts(methods[m][name][depth]))]
-        for rig, methods in summary.items()
-        for name in REGIONS
-        for depth in methods[EXACT][name]
-    ]
-    unsolved = "; ".join(
-        f"{rig}: " + ", ".join(f"{NAMES[m]} {100 * found[m]['unsolved']:.2g} %" for m in METHODS)
-        for rig, found in summary.items()
-    )
-    return "\n".join(
-        [
-            f"rms pointing error, medians and quartiles over {seeds_of(settings)}; px at the wanted focal length",
-            table(head, lines),
-            f"without a solution: {unsolved}; the exact range's worst error: {_worst(summary):.1e} degrees",
-        ]
-    )
-
-
-def _texts(found: Mapping[str, float]) -> tuple[str, float]:
-    if math.isnan(found["deg"]):
-        return "-", math.nan
-    return f"{found['deg']:.2g} ({found['deg_low']:.2g} to {found['deg_high']:.2g})", found["px"]
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
@@ -299,18 +261,5 @@ def _map(rows: Sequence[Row], method: Method, depth: float) -> tuple[Array, Arra
 
 
 SETTINGS = ShortcutSettings()
-EXPERIMENT = Experiment(
-    "shortcut",
-    "The exact range beside the paper's shortcut over the fixed camera's view.",
-    SETTINGS,
-    replace(SETTINGS, seeds=2, depths=(5.0, 20.0), grid=(9, 7), near=20),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    cost_s=3.0,
-    bounded=bounded,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=2, depths=(5.0, 20.0), grid=(9, 7), near=20)
+COST_S = 3.0

@@ -11,29 +11,25 @@ Ground truth judges both. The clock starts when the target is wholly in the fixe
 neither searches: the head points in a random direction of the fixed view, at the shortest focal length, so that the
 target has to be found. The single camera also loses the overview: `watched` is the area of its view over that of the
 fixed camera's, which is 1 for the pair.
-
-    python -m experiments.following.single_ptz [--seeds 6] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Gt, Interval, Le
 from matplotlib.figure import Figure
 
 from cotarget.config import SimConfig
-from cotarget.errors import ConfigError
 from cotarget.metrics import BACKGROUND_S, score
 from cotarget.metrics import Row as Judged
+from cotarget.schema import Positive
 from cotarget.sim.targets.random_paths import LONE, SECONDS
-from experiments.engine.checks import check_above, check_ways
-from experiments.engine.harness import Experiment, Row, Settings, seeds_of
-from experiments.engine.spread import bars, mean_of
-from experiments.engine.texts import table
+from experiments.engine import Count, Row, Settings
 from experiments.following.single_runs import PAIR, WAYS, held
+from experiments.tables import bars, grouped, mean_of
 
 WIDE_PX = SimConfig().fixed.focal_px[0]
 LEAST_MISS = 0.05
@@ -53,23 +49,14 @@ class SingleSettings(Settings):
             that of each target.
     """
 
-    seeds: int = 6
-    seconds: float = SECONDS
+    seeds: Count = 6
+    seconds: Annotated[float, Gt(BACKGROUND_S), Le(SECONDS)] = SECONDS
     targets: tuple[str, ...] = LONE
-    misses: tuple[float, ...] = (0.05, 0.5, 0.9)
-    lasts_s: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values."""
-        super().__post_init__()
-        check_above(BACKGROUND_S, self, "seconds")  # start of the clock
-        check_ways(self, "seconds")
-        if parts := [miss for miss in self.misses if not 0 <= miss <= 1]:
-            raise ConfigError(f"misses: {parts[0]:g} is no part of the frames, which is 0 to 1")
-        check_above(0, self, *(() if self.lasts_s is None else ("lasts_s",)))
+    misses: tuple[Annotated[float, Interval(ge=0, le=1)], ...] = (0.05, 0.5, 0.9)
+    lasts_s: Positive | None = None
 
 
-def one(_: None, settings: SingleSettings, seed: int) -> list[Row]:
+def one(settings: SingleSettings, seed: int) -> list[Row]:
     """Run each target with the pair and with the single camera; give a row per run."""
     rows: list[Row] = []
     for name in settings.targets:
@@ -109,8 +96,7 @@ def _watched(since: Sequence[Judged], way: str) -> float | None:
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """Give means over the seeds with standard errors by target and way, and quartiles of the time to acquire."""
     summary: dict[str, dict[str, dict[str, float]]] = {}
-    for name, way in dict.fromkeys((row["target"], row["way"]) for row in rows):
-        mine = [row for row in rows if (row["target"], row["way"]) == (name, way)]
+    for (name, way), mine in grouped(rows, "target", "way").items():
         found: dict[str, float] = {}
         for key in FIGURES:
             found[key], found[f"{key}_error"] = mean_of(_told(mine, key))
@@ -149,26 +135,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def describe(settings: SingleSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per target and way."""
-    head = ("", "close-up yield", "in frame", "of all", "offset / width", "watched", "to acquire [s]", "never")
-    lines = [
-        [f"{name}, {way}"]
-        + [f"{found[key]:.2f} +- {found[f'{key}_error']:.2f}" for key in FIGURES[:3]]
-        + [f"{found[key]:.3f} +- {found[f'{key}_error']:.3f}" for key in FIGURES[3:]]
-        + [
-            "{median:.2f} ({low:.2f} to {high:.2f})".format(
-                **{part: found[f"time_to_acquire_s_{part}"] for part in ("low", "median", "high")}
-            ),
-            found["never_acquired"],
-        ]
-        for name, ways in summary.items()
-        for way, found in ways.items()
-    ]
-    words = "means with standard errors; to acquire: median and quartiles; never: part of the runs"
-    return f"pair and lone camera, {settings.seconds:g} s, {seeds_of(settings)}; {words}\n" + table(head, lines)
-
-
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Close-up yield, frames in frame and time to acquire of each way: seeds as points, means with errors as bars."""
     targets, ways = (list(dict.fromkeys(row[key] for row in rows)) for key in ("target", "way"))
@@ -191,18 +157,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = SingleSettings()
-EXPERIMENT = Experiment(
-    "single_ptz",
-    "A single pan-tilt-zoom camera that finds and follows its target by itself, against the pair.",
-    SETTINGS,
-    replace(SETTINGS, seeds=1, seconds=8.0, targets=("person", "bird"), misses=(0.05, 0.9)),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    cost_s=30.0,
-    bounded=bounded,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = replace(SETTINGS, seeds=1, seconds=8.0, targets=("person", "bird"), misses=(0.05, 0.9))
+COST_S = 30.0

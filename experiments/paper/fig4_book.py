@@ -5,37 +5,31 @@ place the zoom camera starts at pan = tilt = 0. It is pointed at the book with t
 in the paper's Fig. 4(c), and then zooms in. This project's pipeline and the paper's method
 (`experiments.paper.paper_loop`) use the same calibration. Ground truth judges each zoom view: target point offset (a
 view without the book counts half the diagonal), size over the wanted size, and whether the book's marker decodes.
-
-    python -m experiments.paper.fig4_book [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
 import math
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from annotated_types import Ge, Le
 
 from cotarget.calibration import Calibration
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
-from cotarget.errors import ConfigError
 from cotarget.evaluation import observe
 from cotarget.metrics import Row as Judged
 from cotarget.pipeline import FollowSettings, Step
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.targets.random_paths import BOOK_MOVED_AT, BOOK_TAKES, lone_path
 from cotarget.sim.world import SimWorld
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.panels import laid_out
-from experiments.engine.pictured import Pictured
-from experiments.engine.spread import in_words, points, spread, ways_of
-from experiments.engine.texts import table
+from experiments.engine import Count, Pictured, Row
 from experiments.following.field import OwnRigInField, calibrated
+from experiments.paper.panels import laid_out
 from experiments.paper.paper_loop import OURS, WAYS, picture_name
+from experiments.tables import grouped, outside, spread
 
 NAME = "book"
 TURN_S = 1.2  # time for the head to turn to the book, with all latencies [s]
@@ -56,38 +50,21 @@ class BookSettings(OwnRigInField):
     """Settings: time for head and lens, and places.
 
     Attributes:
-        seconds: time from centred to close-up [s].
+        seconds: time from centred to close-up; the book leaves its first place when it is moved [s].
         places: number of places of the book, one or two.
-
-    Raises:
-        ConfigError: more places, a run too short to show anything, or one during which the book is moved.
     """
 
-    seeds: int = 2
-    seconds: float = 2.0
-    places: int = 2
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.places <= len(ARRIVES_S):
-            raise ConfigError(f"places = {self.places}: the book is at 1 or {len(ARRIVES_S)}")
-        if self.seconds < LEAST_S:
-            raise ConfigError(
-                f"seconds = {self.seconds:g}: at least {LEAST_S:g} are needed for a frame of both cameras"
-            )
-        super().__post_init__()
-
-    @property
-    def lasting_s(self) -> tuple[float, float]:
-        """Limits of a run's length [s]; the book leaves its first place when it is moved, and its second one never."""
-        return 0.0, BOOK_MOVED_AT[0] - TURN_S
+    seeds: Count = 2
+    seconds: Annotated[float, Ge(LEAST_S), Le(BOOK_MOVED_AT[0] - TURN_S)] = 2.0
+    places: Annotated[int, Ge(1), Le(len(ARRIVES_S))] = 2
 
 
-def one(calibration: Calibration, settings: BookSettings, seed: int) -> Pictured:
+def one(settings: BookSettings, seed: int) -> Pictured:
     """Show the book at each place by each method; give a row per run, and pictures of the first seed's last place."""
     rows: list[Row] = []
     pictures: dict[str, bytes] = {}
     for way in WAYS:
-        mine, shown = _shown(calibration, settings, seed, way)
+        mine, shown = _shown(calibrated(settings), settings, seed, way)
         rows += mine
         if seed == settings.seed_base:
             pictures[picture_name("fig4", way)] = _picture(shown)
@@ -114,7 +91,7 @@ def _shown(
             ends: list[Step] = []
             for wanted, seconds in ((speck, TURN_S), (target, settings.seconds)):
                 detector = make_detector(target, config.sim.fixed.rate_hz)
-                ends += _ends(WAYS[way](rig, calibration, wanted, detector, seconds=seconds, settings=how))
+                ends += first_and_last(WAYS[way](rig, calibration, wanted, detector, seconds=seconds, settings=how))
             shown = dict(zip(STAGES, (ends[0], ends[1], ends[3]), strict=True))
             row = {"seed": seed, "place": place, "way": way}
             for stage, step in shown.items():
@@ -123,7 +100,7 @@ def _shown(
     return rows, shown
 
 
-def _ends(steps: Iterator[Step]) -> tuple[Step, Step]:
+def first_and_last(steps: Iterator[Step]) -> tuple[Step, Step]:
     """Give the first Step in which the book is found, before the head has turned, and the last Step."""
     first = last = next(steps)
     for last in steps:
@@ -160,66 +137,19 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:
     """Give median, least and largest over all places by method and stage, and the fraction of decoded markers."""
     return {
         way: {
-            stage: {key: spread(mine, f"{stage} {key}") for key in KEYS}
+            stage: {key: spread(row[f"{stage} {key}"] for row in mine) for key in KEYS}
             | {"decoded": float(np.mean([row[f"{stage} decoded"] for row in mine]))}
             for stage in STAGES
         }
-        for way, mine in ways_of(rows).items()
+        for way, mine in grouped(rows, "way").items()
     }
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List this project's figures that miss their goal."""
-    return [
-        f"{stage}: {key}"
-        for stage, wanted in WANTED.items()
-        for key, (low, high) in wanted.items()
-        if not low <= (found["median"] if isinstance(found := summary[OURS][stage][key], Mapping) else found) <= high
-    ]
-
-
-def describe(settings: BookSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per method and stage."""
-    lines = [
-        [f"{way}: {stage}", *(in_words(found[key]) for key in KEYS), found["decoded"]]
-        for way, stages in summary.items()
-        for stage, found in stages.items()
-    ]
-    head = ("zoom view", "offset, px", "% of width", "size / wanted", "focal length, px", "decoded")
-    what = f"a book, {settings.places} places a seed, median (least to largest) of {seeds_of(settings)}"
-    return f"{what}\n{table(head, lines)}"
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Offset from the middle of the zoom view and size over the one wanted: medians, least to largest, each place."""
-    ways = ways_of(rows)
-    for ax, key, label in zip(
-        figure.subplots(1, 2),
-        ("tpo_percent", "size_ratio"),
-        ("offset [% of the width]", "size / wanted size"),
-        strict=True,
-    ):
-        for i, (way, mine) in enumerate(ways.items()):
-            for k, stage in enumerate(STAGES):
-                values = [value for row in mine if (value := row[f"{stage} {key}"]) is not None]
-                points(ax, k + i / 3, values, color=f"C{i}", label=way if k == 0 else None)
-        ax.set(yscale="log", ylabel=label, xticks=range(len(STAGES)), xticklabels=STAGES)
-        ax.legend(frameon=False)
+    return [text for stage, wanted in WANTED.items() for text in outside(summary[OURS][stage], wanted, stage)]
 
 
 SETTINGS = BookSettings()
-EXPERIMENT = Experiment(
-    "fig4_book",
-    "Fig. 4: a book about 10 m away, found by its colours: before, centred, close up.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, places=1, calibrated=False),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    prepare=calibrated,
-    cost_s=40.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = dataclasses.replace(SETTINGS, seeds=1, places=1, calibrated=False)
+COST_S = 40.0

@@ -4,36 +4,30 @@ This project's pipeline and the paper's method (`experiments.paper.paper_loop`) 
 plain detector, `mog2`; `--set fig5_person.detector=motion` gives this project's pipeline its own. The person walks in
 after the background was learnt for about two seconds, then goes to and fro about 10 m away. Figures are medians over
 the seeds with the least and the largest, as defined in `cotarget.metrics`, by ground truth.
-
-    python -m experiments.paper.fig5_person [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
-import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from annotated_types import Gt
 
 from cotarget.calibration import Calibration
 from cotarget.config import DetectorName
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
-from cotarget.errors import ConfigError
 from cotarget.evaluation import add_row
 from cotarget.metrics import Row as Judged
 from cotarget.metrics import score
 from cotarget.pipeline import FollowSettings, Step
 from cotarget.sim.world import SimWorld
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.panels import laid_out
-from experiments.engine.pictured import Pictured
-from experiments.engine.spread import by_way, spread, ways_of, ways_table
+from experiments.engine import Count, Pictured, Row
 from experiments.following.field import OwnRigInField, calibrated, watched_in
+from experiments.paper.panels import laid_out
 from experiments.paper.paper_loop import OURS, WAYS, picture_name
+from experiments.tables import grouped, outside, spread
 
 NAME = "person"
 MOMENTS, FIRST_S = 3, 4.4  # moments in the picture; time of the first [s], after the person's entry at 3 s
@@ -63,35 +57,21 @@ class PersonSettings(OwnRigInField):
     """Settings: length of the runs, and detector.
 
     Attributes:
+        seconds: length of a run; the person's path does not end (`cotarget.sim.targets.paths`) [s].
         detector: detector of this project's pipeline, mog2 or motion.
-
-    Raises:
-        ConfigError: a run ends before there is anything to show.
     """
 
-    seeds: int = 2
-    seconds: float = 7.0
+    seeds: Count = 2
+    seconds: Annotated[float, Gt(FIRST_S)] = 7.0
     detector: DetectorName = "mog2"
 
-    def __post_init__(self) -> None:
-        if self.seconds <= FIRST_S:
-            raise ConfigError(
-                f"seconds = {self.seconds:g}: more than {FIRST_S:g} are needed, when the person has come in"
-            )
-        super().__post_init__()
 
-    @property
-    def lasting_s(self) -> tuple[float, float]:
-        """Limits of a run's length [s]; the person's path does not end (`cotarget.sim.targets.paths`)."""
-        return FIRST_S, math.inf
-
-
-def one(calibration: Calibration, settings: PersonSettings, seed: int) -> Pictured:
+def one(settings: PersonSettings, seed: int) -> Pictured:
     """Follow a person by each method; give a row per method, and pictures of the first seed."""
     rows: list[Row] = []
     pictures: dict[str, bytes] = {}
     for way in WAYS:
-        row, moments = _followed(calibration, settings, seed, way)
+        row, moments = _followed(calibrated(settings), settings, seed, way)
         rows.append(row)
         if seed == settings.seed_base:
             pictures[picture_name("fig5", way)] = _picture(moments)
@@ -134,45 +114,19 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """Give median, least and largest of each method's figures over the seeds, and mark runs without a figure."""
     return {
         way: {
-            key: spread(mine, key) | {"not measured": float(sum(row[key] is None for row in mine))} for key in FIGURES
+            key: spread(row[key] for row in mine) | {"not measured": float(sum(row[key] is None for row in mine))}
+            for key in FIGURES
         }
-        for way, mine in ways_of(rows).items()
+        for way, mine in grouped(rows, "way").items()
     }
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List this project's figures that miss their goal, or were not measured in some run."""
-    return [
-        key
-        for key, (low, high) in WANTED.items()
-        if summary[OURS][key]["not measured"] or not low <= summary[OURS][key]["median"] <= high
-    ]
-
-
-def describe(settings: PersonSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per figure, a column per method."""
-    what = f"a person, {settings.detector}, median (least to largest) of {seeds_of(settings)}"
-    return ways_table(what, summary, FIGURES)
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Error in the fixed view, offset, size and yield in the close-up: medians, least to largest, each seed a point."""
-    by_way(np.ravel(figure.subplots(2, 2)), rows, {key: FIGURES[key] for key in SHOWN})
+    ours = summary[OURS]
+    return [f"{key}: not measured in some run" for key in WANTED if ours[key]["not measured"]] + outside(ours, WANTED)
 
 
 SETTINGS = PersonSettings()
-EXPERIMENT = Experiment(
-    "fig5_person",
-    "Fig. 5: a person who walks indoors, found by an adaptive Gaussian mixture: fixed view, close-up.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, calibrated=False),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    prepare=calibrated,
-    cost_s=30.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, calibrated=False)
+COST_S = 30.0

@@ -5,38 +5,32 @@ clouds drift and shadows cross the ground. This project detects them by an adapt
 components, with additions for foliage (`motion`; `--set fig6_outdoors.detector=mog2` takes the plain mixture). The
 paper's method, the plain mixture and one open-loop command at a time (`experiments.paper.paper_loop`), uses the same
 calibration. The policy is the paper's, first-come.
-
-    python -m experiments.paper.fig6_outdoors [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from annotated_types import Gt
 
-from cotarget.calibration import Calibration
 from cotarget.config import DetectorName, RigConfig, TargetProfile, Waypoint
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
-from cotarget.errors import ConfigError, choices
 from cotarget.evaluation import closeup_of, on_target
 from cotarget.pipeline import FollowSettings, Step
 from cotarget.sim.targets.person import PERSON_HEIGHT
 from cotarget.sim.targets.target import true_size
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.panels import laid_out
-from experiments.engine.pictured import Pictured
-from experiments.engine.spread import by_way, spread, ways_of, ways_table
+from experiments.engine import Count, Pictured, Row
 from experiments.following.field import OwnRigInField, calibrated, watched_in
 from experiments.paper.handover import Moment, figures
+from experiments.paper.panels import laid_out
 from experiments.paper.paper_loop import OURS, WAYS, picture_name
+from experiments.tables import spreads
 
 KIND = "person"
 NAMES = (KIND, f"{KIND}2", f"{KIND}3")
@@ -78,27 +72,18 @@ class OutdoorSettings(OwnRigInField):
     """Settings: length of the runs, and detection.
 
     Attributes:
+        seconds: length of a run; the paths end outside the view [s].
         detector: detector of this project's pipeline, motion or mog2.
         ways: methods of following, by name.
     """
 
-    seeds: int = 2
-    seconds: float = 12.0
+    seeds: Count = 2
+    seconds: Annotated[float, Gt(ENTERS_S)] = 12.0
     detector: DetectorName = "motion"
     ways: tuple[str, ...] = tuple(WAYS)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if unknown := [way for way in self.ways if way not in WAYS]:
-            raise ConfigError(f"ways: '{unknown[0]}' is not one of: {choices(WAYS)}")
 
-    @property
-    def lasting_s(self) -> tuple[float, float]:
-        """Limits of a run's length [s]: the first person's entry, and the end of the paths outside the view."""
-        return ENTERS_S, math.inf
-
-
-def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictured:
+def one(settings: OutdoorSettings, seed: int) -> Pictured:
     """Follow the persons by each method; give a row per method, and pictures of the first seed."""
     config = outdoors(settings, seed)
     how = FollowSettings()  # its policy is first-come
@@ -108,7 +93,7 @@ def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictu
         watch, found_by = Watch(), settings.detector if way == OURS else "mog2"
         target = dataclasses.replace(config.target(KIND), detector=found_by)
         detector, world = make_detector(target, config.sim.fixed.rate_hz), SimWorld(config)
-        for step, truth in watched_in(world, detector, calibration, target, settings.seconds, how, WAYS[way]):
+        for step, truth in watched_in(world, detector, calibrated(settings), target, settings.seconds, how, WAYS[way]):
             watch.see(step, truth, target)
         rows.append({"seed": seed, "way": way, "detector": found_by, **figures(watch.moments)})
         if seed == settings.seed_base and watch.shown:
@@ -142,11 +127,12 @@ class Watch:
     Attributes:
         moments: the judged moments.
         shown: Steps with captions.
+        names: targets of the tracks, while they are on one target only.
     """
 
     moments: list[Moment] = field(default_factory=list)
     shown: list[tuple[Step, str]] = field(default_factory=list)
-    _names: dict[int, str] = field(default_factory=dict)  # targets of the tracks, while they are on one target only
+    names: dict[int, str] = field(default_factory=dict)
     _last: tuple[Step, str] | None = None
     _since: float = 0.0
 
@@ -157,8 +143,8 @@ class Watch:
         present = frozenset(name for name, each in outlines.items() if each is not None and each.visible >= PRESENT)
         name, tpe_px, closeup = None, math.nan, None
         if step.target is not None:
-            self._name(step.target.id, [each for _, each in on_target([step.target], outlines)])
-            name = self._names.get(step.target.id)
+            self.assign(step.target.id, [each for _, each in on_target([step.target], outlines)])
+            name = self.names.get(step.target.id)
         if step.target is not None and name is not None:
             closeup = closeup_of(truth, name, target, t_zoom)
             if not step.target.missed and not step.target.shared:
@@ -167,10 +153,10 @@ class Watch:
         self.moments.append(Moment(t_zoom, name, step.target is not None, present, tpe_px, closeup))
         self._choose(step, name)
 
-    def _name(self, track: int, on: Sequence[str]) -> None:
+    def assign(self, track: int, on: Sequence[str]) -> None:
         """Assign a target to a track: the earlier one while the track is on it, else the nearest that it is on."""
-        if on and self._names.get(track) not in on:
-            self._names[track] = on[0]
+        if on and self.names.get(track) not in on:
+            self.names[track] = on[0]
 
     def _choose(self, step: Step, name: str | None) -> None:
         """Keep a Step of each target in close-up, and the last one before it leaves."""
@@ -210,39 +196,19 @@ def _picture(shown: Sequence[tuple[Step, str]]) -> bytes:
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """Give median, least and largest of each method's figures over the seeds, from the runs that have them."""
-    return {way: {key: spread(mine, key) for key in FIGURES} for way, mine in ways_of(rows).items()}
+    return spreads(rows, "way", FIGURES)
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List this project's figures that miss their goal."""
     mine = summary.get(OURS, {})
-    return [key for key, (which, low, high) in WANTED.items() if mine and not low <= mine[key][which] <= high]
-
-
-def describe(settings: OutdoorSettings, summary: Mapping[str, Any]) -> str:
-    """Format a line per figure, a column per method."""
-    what = f"three persons, {settings.detector}, {settings.seconds:g} s, median (least to largest) of"
-    return ways_table(f"{what} {seeds_of(settings)}", summary, FIGURES)
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """How many were followed, and how well: medians, least to largest, each seed a point."""
-    by_way(np.ravel(figure.subplots(2, 3)), rows, {key: FIGURES[key] for key in SHOWN})
+    return [
+        f"{key}: {mine[key][which]:.3g}, not {low:g} to {high:g}"
+        for key, (which, low, high) in WANTED.items()
+        if mine and not low <= mine[key][which] <= high
+    ]
 
 
 SETTINGS = OutdoorSettings()
-EXPERIMENT = Experiment(
-    "fig6_outdoors",
-    "Fig. 6: several persons outdoors, the first followed until it leaves: foreground, fixed view, close-up.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=9.0, calibrated=False, ways=(OURS,)),  # the first handover
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    prepare=calibrated,
-    cost_s=80.0,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = dataclasses.replace(SETTINGS, seeds=1, seconds=9.0, calibrated=False, ways=(OURS,))
+COST_S = 80.0

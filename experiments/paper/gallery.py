@@ -16,12 +16,11 @@ import numpy as np
 from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError, choices
 from cotarget.files import write_atomically
-from experiments.engine.arguments import check_folder
-from experiments.engine.harness import FIGURE
+from experiments.command import OUT
 from experiments.paper.paper_loop import WAYS, picture_name
+from experiments.report import FIGURE
 
 PROGRAM = "python -m experiments.paper.gallery"
-RESULTS = Path("experiments-out")
 PICTURES = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 WIDEST_PX = 1280
 QUALITY = 85
@@ -57,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = Parser(prog=PROGRAM, description=(__doc__ or "").splitlines()[0])
     names = tuple(dict.fromkeys(each.experiment for each in SHOWN))
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"experiments whose pictures; all of {choices(names)}")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help=f"their folder ({RESULTS})")
+    parser.add_argument("--results", type=Path, default=OUT, metavar="DIR", help=f"their folder ({OUT})")
     parser.add_argument("--out", type=Path, default=PICTURES, metavar="DIR", help="for the pictures")
     given = parser.parse_args(arguments)
     try:
@@ -85,7 +84,6 @@ def gather(results: Path, out: Path, names: Collection[str]) -> list[Path]:
     Raises:
         ConfigError: a picture is missing, cannot be read or cannot be written.
     """
-    check_folder(out)
     shown = [each for each in SHOWN if each.experiment in names]
     files = {out / f"{each.name}.jpg": _jpeg(results / each.experiment / f"{each.picture}.png") for each in shown}
     out.mkdir(parents=True, exist_ok=True)

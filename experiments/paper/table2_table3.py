@@ -6,19 +6,15 @@ replace them. One calibration gives both tables, because rendering takes most of
 
 The error over the seeds is compared with the standard deviation that each calibration predicts. Errors of rotations are
 the components of the rotation vector from the true orientation to the estimate.
-
-    python -m experiments.paper.table2_table3 [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
 import math
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.calibrate import calibrate
@@ -26,9 +22,9 @@ from cotarget.geometry import Array, RigidTransform, pose
 from cotarget.report.text import value_and_sigma
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
-from experiments.engine.harness import Experiment, Row, seeds_of
-from experiments.engine.texts import rms, table
+from experiments.engine import Count, Row
 from experiments.following.own_rig import OwnRig
+from experiments.tables import columns, grouped, rms
 
 # Table 2: rows of the paper's list [v, u]; the CCD's size and the pitch are the manufacturers'.
 CAMERAS = {"zoom": "Canon PowerShot S5 IS (zoom camera)", "fixed": "Philips LTC 0600 (stationary camera)"}
@@ -56,11 +52,11 @@ class Settings(OwnRig):
         placements: number of board placements.
     """
 
-    seeds: int = 3
-    placements: int = 30
+    seeds: Count = 3
+    placements: Count = 30
 
 
-def one(_: None, settings: Settings, seed: int) -> list[Row]:
+def one(settings: Settings, seed: int) -> list[Row]:
     """Calibrate the rig once; give a row per parameter."""
     config = settings.config("indoor", (), seed)
     world = SimWorld(config)
@@ -75,7 +71,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
         owner = "zoom[0]" if camera == "zoom" else camera
         sigmas = [_sigma(calibration, f"{owner}.{name}") for name in LENS]
         for name, value, sigma, is_so in zip(LENS, mine, sigmas, true, strict=True):
-            rows.append(_row(seed, camera, name, value, sigma, is_so, value - is_so))
+            rows.append(row_of(seed, camera, name, value, sigma, is_so, value - is_so))
     for name in TRANSFORMS:
         rows += _pose_rows(seed, calibration, name, getattr(config.sim, name))
     return rows
@@ -88,10 +84,10 @@ def _pose_rows(seed: int, calibration: Calibration, name: str, true: RigidTransf
     vectors = [each.rotation.as_rotvec(degrees=True) for each in (mine, true)]
     for i, axis in enumerate(PLACES):
         value, is_so = MILLI * mine.translation[i], MILLI * true.translation[i]
-        yield _row(seed, name, axis, value, MILLI * _sigma(calibration, f"{name}.{axis}"), is_so, value - is_so)
+        yield row_of(seed, name, axis, value, MILLI * _sigma(calibration, f"{name}.{axis}"), is_so, value - is_so)
     for i, axis in enumerate(TURNS):
         sigma = math.degrees(_sigma(calibration, f"{name}.{axis}"))
-        yield _row(seed, name, axis, vectors[0][i], sigma, vectors[1][i], turned[i])
+        yield row_of(seed, name, axis, vectors[0][i], sigma, vectors[1][i], turned[i])
 
 
 def _sigma(calibration: Calibration, name: str) -> float:
@@ -100,7 +96,8 @@ def _sigma(calibration: Calibration, name: str) -> float:
     return math.nan if covariance is None else float(covariance.sigma(name))
 
 
-def _row(seed: int, of: str, name: str, found: float, sigma: float, true: float, error: float) -> Row:
+def row_of(seed: int, of: str, name: str, found: float, sigma: float, true: float, error: float) -> Row:
+    """Make the row of a parameter."""
     values = {"found": found, "sigma": sigma, "true": true, "error": error}
     return {"seed": seed, "of": of, "parameter": name, **{key: float(value) for key, value in values.items()}}
 
@@ -108,12 +105,8 @@ def _row(seed: int, of: str, name: str, found: float, sigma: float, true: float,
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Give each parameter's truth, mean and rms over the seeds, and the consistency of sigma."""
     found: dict[str, Any] = {}
-    for of in dict.fromkeys(row["of"] for row in rows):
-        mine = [row for row in rows if row["of"] == of]
-        found[of] = {
-            name: _parameter([row for row in mine if row["parameter"] == name])
-            for name in dict.fromkeys(row["parameter"] for row in mine)
-        }
+    for of, mine in grouped(rows, "of").items():
+        found[of] = {name: _parameter(each) for name, each in grouped(mine, "parameter").items()}
     found["all"] = {
         "error over sigma": rms(row["error"] / row["sigma"] for row in rows),
         "largest bias over its scatter": max(
@@ -176,8 +169,8 @@ def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
             f"Table 2: as the run of seed {settings.seed_base} has it, ± the standard deviation that it predicts\n"
             + _table_2(settings, summary),
             *(_matrices(words, summary[name], settings) for name, words in TRANSFORMS.items()),
-            f"error of one run (rms over {seeds_of(settings)}) beside the standard deviation that it predicts\n"
-            + table(
+            f"error of one run (rms over {settings.seeds} seeds) beside the standard deviation that it predicts\n"
+            + columns(
                 (
                     "px, mm, degrees",
                     "parameter",
@@ -206,9 +199,9 @@ def _table_2(settings: Settings, summary: Mapping[str, Any]) -> str:
     """Format Table 2 for the paper's cameras, or for a user's own, whose manufacturer and CCD size are unknown."""
     head = ("rows are [v, u]", "focal length, px", "mm", "centre, px", "CCD, mm", "pitch, mm")
     if not settings.rig:
-        return table(head, _lens(summary, CAMERAS, "  true, as printed", PITCH_MM, CCD_MM))
+        return columns(head, _lens(summary, CAMERAS, "  true, as printed", PITCH_MM, CCD_MM))
     pitch_mm = {"zoom": settings.config("indoor", (), settings.seed_base).sim.zoom.pitch_mm}
-    return table([words for words in head if words != "CCD, mm"], _lens(summary, CAMERA_WORDS, "  true", pitch_mm))
+    return columns([words for words in head if words != "CCD, mm"], _lens(summary, CAMERA_WORDS, "  true", pitch_mm))
 
 
 def _lens(
@@ -278,38 +271,6 @@ def _errors(summary: Mapping[str, Any]) -> Iterator[list[Any]]:
             yield [words, name, *numbers, *spread, f"{each['error'] / each['sigma']:.2f}", f"{each['bias']:.1f}"]
 
 
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Each run's error over its own predicted standard deviation, by parameter; the band is twice that."""
-    ax = figure.subplots()
-    names = list(dict.fromkeys((row["of"], row["parameter"]) for row in rows))
-    ax.axhspan(-2, 2, color="#dddddd", lw=0)
-    for of in dict.fromkeys(row["of"] for row in rows):
-        mine = [row for row in rows if row["of"] == of]
-        ax.plot(
-            [names.index((of, row["parameter"])) for row in mine],
-            [row["error"] / row["sigma"] for row in mine],
-            "o",
-            alpha=0.7,
-            label={**TRANSFORMS, **CAMERA_WORDS}[of],
-        )
-    ax.set_xticks(range(len(names)), [f"{TRANSFORMS.get(of, of)} {name}" for of, name in names], rotation=60)
-    ax.set(ylabel="error / predicted standard deviation")
-    ax.legend(frameon=False, ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.1))
-
-
 SETTINGS = Settings()
-EXPERIMENT = Experiment(
-    "table2_table3",
-    "Tables 2 and 3: intrinsics, Gamma and T as calibrated, with uncertainty, beside the truth.",
-    SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, placements=12),
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    cost_s=20.0,
-    bounded=bounded,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+QUICK = dataclasses.replace(SETTINGS, seeds=1, placements=12)
+COST_S = 20.0

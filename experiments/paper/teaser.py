@@ -19,7 +19,6 @@ from cotarget.drawing import write_text
 from cotarget.errors import CotargetError
 from cotarget.files import write_atomically
 from cotarget.rig import Image
-from experiments.engine.arguments import check_folder
 from experiments.paper.gallery import PICTURES
 
 PROGRAM = "python -m experiments.paper.teaser"
@@ -37,7 +36,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=TEASER, metavar="FILE", help="the picture, a .webp")
     out: Path = parser.parse_args(arguments).out
     try:
-        check_folder(out.parent)
         effects = SimEffects(noise=False, jpeg=False)  # these would take most of the file
         config = ct.RigConfig(sim=ct.SimConfig(scene="outdoor", targets=("bird",), effects=effects))
         write_atomically(out, animated_webp(list(pictures(config)), config.sim.fixed.rate_hz / EVERY))

@@ -8,28 +8,21 @@ T and P are rigid motions.
 The exact method is run too, with a T that gives every printed digit with the least rotation. It is one of many, because
 the printed results leave T's rotation about the line of sight and its first translation open. Its results are not
 compared with the paper's claims.
-
-    python -m experiments.paper.worked_example [--out DIR]
 """
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from cotarget.camera import Intrinsics, focal_for_size
 from cotarget.geometry import Array, RigidTransform, Rotation, angle_between
 from cotarget.pantilt import base_head, shortcut, solve
-from experiments.engine import harness
-from experiments.engine.harness import Experiment, Row
-from experiments.engine.texts import table
+from experiments.engine import Row, Settings
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 
 # Table 2 as (u, v); the paper lists [v, u].
@@ -48,22 +41,14 @@ CLOSEUP_PX = 7155.0  # focal length of the paper's close-up, at which errors are
 OFF_MM = 20.0  # least difference of both norms of a rigid motion
 KNOWN = "x_fixed: y [mm]"  # does not follow from the paper's own numbers
 BESIDE = ("exact", "stand-in T")  # steps without a counterpart in the paper
-RIGHT, WRONG, OTHER = "#1f6f8b", "#d9534f", "#999999"
 
 
-@dataclass(frozen=True)
-class Settings(harness.Settings):
-    """Settings without choices; nothing is random."""
-
-    seeds: int = 1
-
-
-def once(settings: Settings) -> Sequence[int]:
+def jobs(settings: Settings) -> Sequence[int]:
     """Give one job, whatever the number of seeds."""
     return (settings.seed_base,)
 
 
-def one(_: None, settings: Settings, seed: int) -> list[Row]:
+def one(settings: Settings, seed: int) -> list[Row]:
     """Compute every step; give a row per number: printed value (nan if none), computed value, and remark."""
     return [
         {"step": step, "quantity": quantity, "unit": unit, "printed": printed, "last_digit": digit, "found": found}
@@ -194,28 +179,6 @@ def _is_beside(key: str) -> bool:
     return any(f". {step}: " in key for step in BESIDE)
 
 
-def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
-    """Format a line per number."""
-    words = {True: "as printed", False: "NOT as printed", None: ""}
-    lines = [
-        (
-            key,
-            _number(line["printed"], line),
-            _number(line["found"], line),
-            "" if _is_beside(key) else words[line["agrees"]],
-            line["remark"],
-        )
-        for key, line in summary.items()
-    ]
-    return "Section 4.2, step by step\n" + table(("", "printed", "follows", "", "remark"), lines)
-
-
-def _number(value: float, line: Mapping[str, Any]) -> str:
-    """Format a number with one digit more than is printed."""
-    decimals = 1 - round(math.log10(line["last_digit"]))
-    return "-" if math.isnan(value) else f"{value:.{decimals}f}"
-
-
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List numbers that follow from the paper in another way than this module states."""
     own = {key: line for key, line in summary.items() if not _is_beside(key)}
@@ -232,61 +195,5 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     return texts
 
 
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """The printed numbers beside what follows, what a rigid motion may not change, and what the shortcut misses by."""
-    figure.set_size_inches(13, 4.8)
-    printed, rigid, misses = figure.subplots(1, 3, width_ratios=(2, 1, 1))
-    _printed(printed, [row for row in rows if not math.isnan(row["printed"])])
-    norms = [row for row in rows if row["quantity"].startswith("|x_")]
-    for i, row in enumerate(norms):
-        rigid.plot([norms[0]["found"], row["found"]], [i, i], color=WRONG)
-        rigid.plot(row["found"], i, "o", color="k")
-        rigid.annotate(f"{row['found']:.1f}", (row["found"], i), (0, 8), textcoords="offset points", ha="center")
-    rigid.axvline(norms[0]["found"], color="k", lw=0.8)
-    rigid.set_yticks(range(len(norms)), [row["quantity"].replace(", ", ",\n") for row in norms])
-    rigid.set(xlabel="[mm]", xticks=[10420, 10450], xlim=(10410, 10460), ylim=(-0.7, len(norms) - 0.5))
-    rigid.set_title("a rotation takes one to the other", size="medium")
-    off = [row for row in rows if row["quantity"].startswith("misses")]
-    bars = misses.bar([row["quantity"].split(" of ")[1] for row in off], [row["found"] for row in off], color=WRONG)
-    misses.bar_label(bars, fmt="%.1f")
-    misses.set(ylabel=f"[px at f = {CLOSEUP_PX:g} px]", xlabel="the depth taken for the range")
-    misses.set_title("shortcut's miss, stand-in T", size="medium")
-    for ax in (rigid, printed):
-        ax.invert_yaxis()
-
-
-def _printed(ax: "Axes", rows: Sequence[Row]) -> None:
-    """Plot computed minus printed, in units of the last printed digit; within the band both agree."""
-    ax.axvspan(-1, 1, color="#dddddd", lw=0)
-    colours = [OTHER if row["step"] in BESIDE else RIGHT if agrees(row) else WRONG for row in rows]
-    for colour, words in (
-        (RIGHT, "as printed"),
-        (WRONG, "not as printed"),
-        (OTHER, "exact, where the paper has a depth"),
-    ):
-        at = [i for i, each in enumerate(colours) if each == colour]
-        units = [rows[i]["difference"] / rows[i]["last_digit"] for i in at]
-        ax.barh(at, units, color=colour, label=words)
-    ax.set_yticks(range(len(rows)), [f"{row['step']}: {row['quantity']} [{row['unit']}]" for row in rows])
-    ax.set_xscale("symlog")
-    ax.set_xticks([-1, 0, 1, 10], ["-1", "0", "1", "10"])
-    ax.set(xlabel="what follows - what is printed [units of the last digit]")
-    ax.legend(frameon=False, fontsize="small")
-
-
-SETTINGS = Settings()
-EXPERIMENT = Experiment(
-    "worked_example",
-    "Section 4.2 of the paper, step by step, beside the numbers that it prints.",
-    SETTINGS,
-    SETTINGS,
-    one,
-    summarise,
-    describe,
-    plot,
-    missed,
-    jobs=once,
-    cost_s=0.1,
-)
-if __name__ == "__main__":
-    sys.exit(EXPERIMENT.main())
+SETTINGS = Settings(seeds=1)
+COST_S = 0.1

@@ -15,7 +15,7 @@ from cotarget.drivers.clock import MonotonicClock
 from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.plant import Feed, Picture
 from cotarget.rig import Image
-from experiments.engine.harness import Row
+from experiments.engine import Row
 from experiments.wire.rig import beside, load
 
 SIZE = (704, 576)  # 4CIF [px]

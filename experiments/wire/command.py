@@ -17,7 +17,7 @@ from cotarget.emulators.process import EmulatedRig
 from cotarget.pipeline import follow
 from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, Speed
 from cotarget.safety.safe_rig import guard
-from experiments.engine.harness import Row
+from experiments.engine import Row
 from experiments.wire.rig import Tap, exact_calibration, load, tapped
 
 SCENES = {"book": "indoor", "person": "outdoor"}
@@ -127,7 +127,7 @@ def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
         timed = replace(rig, fixed=TimedCamera(rig.fixed, notes), head=TimedHead(rig.head, notes))
         for _ in follow(timed, exact_calibration(emulated.sim), target, detector, seconds=seconds):
             pass
-    return [row | {"load": load()} for row in _parts(notes.turns, taps[0])]
+    return [row | {"load": load()} for row in parts_of(notes.turns, taps[0])]
 
 
 def open_tapped(config: RigConfig, taps: list[Tap]) -> Rig:
@@ -138,7 +138,7 @@ def open_tapped(config: RigConfig, taps: list[Tap]) -> Rig:
     return rig
 
 
-def _parts(turns: list[Turn], tap: Tap) -> list[Row]:
+def parts_of(turns: list[Turn], tap: Tap) -> list[Row]:
     """Give the parts of each turn whose command reached the wire before the next one was given."""
     orders = [t for t, data in tap.written if ORDER.fullmatch(data)]
     calls = [turn for turn in turns if turn.called is not None]

@@ -29,7 +29,7 @@ from cotarget.emulators.process import EmulatedRig, end
 from cotarget.geometry import Array
 from cotarget.sim.targets.paths import waypoint_path
 from cotarget.targeting import Reach, aim
-from experiments.engine.harness import Row
+from experiments.engine import Row
 from experiments.wire.rig import MOUNT, exact_calibration, load
 
 # The book's round: x and z about the fixed camera's axis, at a distance [m], and its period [s].

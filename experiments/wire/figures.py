@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.engine.harness import Row
+from experiments.engine import Row
+from experiments.tables import grouped
 
 MS = 1e3
 SHARE = 0.9  # least fraction of the line's rate
@@ -28,9 +29,7 @@ Figure = dict[str, Any]
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Compute each figure, the parts of commands and ages, and the result of each fault."""
-    of: dict[str, list[Row]] = {}
-    for row in rows:
-        of.setdefault(row["figure"], []).append(row)
+    of = grouped(rows, "figure")
     figures: dict[str, Figure] = {}
     for row in of.get("polls", []):
         figures[f"polls, {row['case']}"] = at_least(row["share"], SHARE, f"of {row['pairs_s'] / row['share']:.1f}/s")
@@ -56,7 +55,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "figures": figures,
         "parts": _parts(of),
         "faults": faults,
-        "again": {name: mine[0][AGAIN] for name, mine in of.items() if AGAIN in mine[0]},
+        "again": {name: again for name, mine in of.items() if (again := mine[0].get(AGAIN))},
         "load": [min(loads, default=math.nan), max(loads, default=math.nan)],
     }
 
@@ -111,11 +110,11 @@ def _fault(rows: Sequence[Row]) -> dict[str, Any]:
     """Give the worst of a fault's repetitions."""
 
     def worst(name: str) -> float:
-        values = [float(row.get(name, math.nan)) for row in rows]
+        values = [math.nan if row.get(name) is None else float(row[name]) for row in rows]
         return float(np.nanmax(values)) if np.isfinite(values).any() else math.nan
 
     # A run that never followed cannot have settled.
-    started = all("settled_s" in row for row in rows)
+    started = all(row.get("settled_s") is not None for row in rows)
     said = (
         "/".join(sorted({row["outcome"] for row in rows})),
         worst("settled_s") if started else math.inf,
@@ -124,8 +123,8 @@ def _fault(rows: Sequence[Row]) -> dict[str, Any]:
         worst("moved_deg"),
         worst("beyond_deg"),
         worst("ended_s"),
-        sum(row.get("hang", 0) for row in rows),
-        sum(row.get("traceback", 0) for row in rows),
+        sum(row.get("hang") or 0 for row in rows),
+        sum(row.get("traceback") or 0 for row in rows),
         len(rows),
     )
     return dict(zip(FAULT_COLUMNS, said, strict=True))

@@ -18,7 +18,7 @@ from cotarget.emulators.process import EmulatedRig
 from cotarget.latency import measure_fixed, measure_head
 from cotarget.rig import Camera, Frame, Speed
 from cotarget.safety.safe_rig import guard
-from experiments.engine.harness import Row
+from experiments.engine import Row
 from experiments.wire.command import ORDER, Notes, TimedHead, Turn, open_tapped
 from experiments.wire.polls import BYTES_S
 from experiments.wire.rig import Tap, exact_calibration, load

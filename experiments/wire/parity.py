@@ -18,7 +18,7 @@ from cotarget.pipeline import follow
 from cotarget.rig import Rig
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
-from experiments.engine.harness import Row
+from experiments.engine import Row
 from experiments.wire.rig import MOUNT, exact_calibration, load
 
 NAME = "book"

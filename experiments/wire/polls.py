@@ -13,7 +13,7 @@ from cotarget.emulators.process import EmulatedRig
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import D46_PAPER
 from cotarget.emulators.serve import UnitPorts
-from experiments.engine.harness import Row
+from experiments.engine import Row
 from experiments.wire.rig import Tap, beside, load, tapped
 
 BAUD, BITS = 9600, 10

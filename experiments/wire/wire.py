@@ -8,27 +8,20 @@
 - parity: final pose of the head, the simulation opened directly and over the wire.
 
 All run in real time beside the emulator, which needs its own core. On a busy machine the figures include its load.
-
-    python -m experiments.wire.wire [--only NAME ...] [--seed-base 0] [--quick] [--out DIR]
 """
 
-import signal
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-from cotarget.cli.common import not_negative, positive_int
-from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, choices
-from experiments.engine.bounds import compare
-from experiments.engine.harness import TERMINATED, Experiment, Row, Settings
-from experiments.engine.texts import table
+from cotarget.schema import Positive
+from experiments.engine import Count, Row, Settings
+from experiments.report import compare
 from experiments.wire import age, command, latency, parity, polls
 from experiments.wire import faults as faults_module
-from experiments.wire.figures import AGAIN, FAULT_COLUMNS, PART_COLUMNS, bounded, missed, summarise
+from experiments.wire.figures import AGAIN, bounded, missed, summarise
 
 NEVER = (0.0, 0.0)  # bound of what must never happen, on any machine: hanging, or moving beyond the limits
 
@@ -53,21 +46,20 @@ class WireSettings(Settings):
     """
 
     only: tuple[str, ...] = ("polls", "age", "command", "faults", "latency", "parity")
-    poll_s: float = 10.0
-    age_s: float = 30.0
+    poll_s: Positive = 10.0
+    age_s: Positive = 30.0
     targets: tuple[str, ...] = ("book", "person")
-    command_s: float = 20.0
+    command_s: Positive = 20.0
     faults: tuple[str, ...] = ()
-    repetitions: int = 1
-    wiggle_s: float = 8.0
-    swing_s: float = 10.0
-    places: int = 2
-    still_s: float = 6.0
-    tries: int = 1
+    repetitions: Count = 1
+    wiggle_s: Positive = 8.0
+    swing_s: Positive = 10.0
+    places: Count = 2
+    still_s: Positive = 6.0
+    tries: Count = 1
 
     def __post_init__(self) -> None:
         """Refuse unknown faults."""
-        super().__post_init__()
         if unknown := sorted(set(self.faults) - set(faults_module.all_faults())):
             raise ConfigError(f"faults: {unknown[0]!r} is not one of: {choices(faults_module.all_faults())}")
 
@@ -77,7 +69,7 @@ def jobs(settings: WireSettings) -> Sequence[int]:
     return range(len(settings.only))
 
 
-def one(_: None, settings: WireSettings, number: int) -> list[Row]:
+def one(settings: WireSettings, number: int) -> list[Row]:
     """Measure one of the figures; give the rows of the last measurement, with its number if it was repeated."""
     for time in range(1, settings.tries + 1):
         with TemporaryDirectory(prefix="cotarget-wire-") as name:
@@ -89,11 +81,12 @@ def one(_: None, settings: WireSettings, number: int) -> list[Row]:
 
 def _spoilt(rows: Sequence[Row]) -> bool:
     """Check whether only bounds on times are exceeded, as on a busy machine, and none on what must never happen."""
-    summary = summarise(rows)
-    measured = bounded(summary)
-    broken = [each for each in compare(EXPERIMENT, summary) if each.name in measured and not each.kept]
+    measured = bounded(summarise(rows))
+    broken = [each for each in compare("wire", measured) if each.name in measured and not each.kept]
     return bool(broken) and all(each.bound != NEVER for each in broken)
 
+
+__all__ = ["bounded", "missed", "summarise"]  # parts of the experiment
 
 RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
     "polls": lambda s, folder: polls.run(folder, s.poll_s),
@@ -107,76 +100,20 @@ RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
 }
 
 
-def describe(settings: WireSettings, summary: Mapping[str, Any]) -> str:
-    """Format the figures as tables."""
-    found = summary["figures"]
-    texts = [
-        table(
-            ("figure", "measured", "wanted", "unit", "reached"),
-            ([n, f["measured"], f["wanted"], f["unit"], "yes" if f["reached"] else "NO"] for n, f in found.items()),
-        )
-    ]
-    for title, columns in (("parts", PART_COLUMNS), ("faults", FAULT_COLUMNS)):
-        if summary[title]:
-            lines = ([name, *(values[column] for column in columns)] for name, values in summary[title].items())
-            texts.append(table((title, *columns), lines))
-    if summary["again"]:
-        times = ", ".join(f"{name} {often} times" for name, often in summary["again"].items())
-        texts.append(
-            f"measured more than once, because a busy machine had spoilt it, of which this is the last: {times}"
-        )
-    texts.append("load of the machine meanwhile, the mean over a minute: {:.1f} to {:.1f}".format(*summary["load"]))
-    return "\n\n".join(texts)
-
-
 SETTINGS = WireSettings(seeds=1)
-EXPERIMENT = Experiment(
-    "wire",
-    "The hardware backend over the wire, through the emulated devices.",
+QUICK = replace(
     SETTINGS,
-    replace(
-        SETTINGS,
-        poll_s=2.0,
-        age_s=6.0,
-        targets=("book",),
-        command_s=6.0,
-        faults=("head.silence", "fixed.stall"),
-        repetitions=1,
-        wiggle_s=5.0,
-        swing_s=6.0,
-        places=1,
-        still_s=4.0,
-        tries=3,
-    ),
-    one,
-    summarise,
-    describe,
-    missed=missed,
-    jobs=jobs,
-    alone=True,
-    cost_s=300.0,
-    bounded=bounded,
+    poll_s=2.0,
+    age_s=6.0,
+    targets=("book",),
+    command_s=6.0,
+    faults=("head.silence", "fixed.stall"),
+    repetitions=1,
+    wiggle_s=5.0,
+    swing_s=6.0,
+    places=1,
+    still_s=4.0,
+    tries=3,
 )
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command."""
-    parser = Parser(prog="python -m experiments.wire.wire", description=EXPERIMENT.purpose)
-    parser.add_argument("--only", nargs="+", choices=tuple(RUNS), default=SETTINGS.only, metavar="NAME", help="figures")
-    parser.add_argument("--fault", nargs="+", choices=faults_module.all_faults(), metavar="DEVICE.FAULT", help="these")
-    parser.add_argument("--repetitions", type=positive_int, metavar="N", help=f"of each fault ({SETTINGS.repetitions})")
-    parser.add_argument("--seed-base", type=not_negative, default=0, metavar="B", help="the seed (0)")
-    parser.add_argument("--quick", action="store_true", help="each for some seconds only")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write result.json and rows.csv there")
-    given = parser.parse_args(arguments)
-    settings = replace(EXPERIMENT.quick if given.quick else SETTINGS, only=tuple(given.only), seed_base=given.seed_base)
-    if given.fault is not None:
-        settings = replace(settings, faults=tuple(given.fault))
-    if given.repetitions is not None:
-        settings = replace(settings, repetitions=given.repetitions)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # ends the emulated devices too
-    return EXPERIMENT.report(settings, given.out, quick=given.quick)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+ALONE = True
+COST_S = 300.0

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from experiments.engine.workers import LINEAR_ALGEBRA
+from experiments.engine import LINEAR_ALGEBRA
 
 COMMAND = """
 import sys

@@ -1,14 +1,11 @@
-"""The environments' experiments: what their figures are made of, and, slowly, a quick run of the speeds."""
+"""The environments' experiments: what their figures are made of."""
 
 import math
 
 import pytest
 
 from benchmarks import env_speed
-from experiments.engine.cases import EXPERIMENTS
 from experiments.following import env_score
-
-BUSY = 0.5  # of the speed wanted is well within what a busy machine may give
 
 
 def timed(what, target, env_us, alone_us, reset_ms=50.0):
@@ -24,7 +21,6 @@ def test_speeds_are_medians_and_ratios_those_of_neighbours():
     )
     assert summary["images, book"]["ratio"] == pytest.approx(0.9)
     assert env_speed.missed(summary) == ["tracks, bird"]
-    assert "tracks, bird" in env_speed.describe(env_speed.SETTINGS, summary)
 
 
 def earned(env, of, policy, reward, served=math.nan):
@@ -47,16 +43,3 @@ def test_scores_are_rewards_a_step_and_means():
     assert means[schedule] == {"most-served": 20.0, "chance": 25.0, "first-come": 5.0}
     assert means[f"{schedule}, served"] == {"most-served": 3.0, "chance": 4.0, "first-come": 1.0}
     assert env_score.missed(summary) == [schedule, f"{schedule}, served"]
-    assert "most-served" in env_score.describe(env_score.SETTINGS, summary)
-
-
-@pytest.mark.slow
-@pytest.mark.render
-def test_a_quick_run_of_the_speeds():
-    summary = env_speed.summarise(env_speed.EXPERIMENT.run(env_speed.EXPERIMENT.quick))
-    for name, found in summary.items():
-        assert found["ratio"] > BUSY * env_speed.WANTED[name.split(",")[0]]
-
-
-def test_both_are_among_all_experiments():
-    assert {env_speed.EXPERIMENT.name, env_score.EXPERIMENT.name} <= set(EXPERIMENTS)

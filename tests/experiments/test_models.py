@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
 from cotarget.schema import validate
 from experiments.calibration import calibration_budget
 from experiments.calibration.synthetic.aims import looking_off
 from experiments.calibration.synthetic.rig import Lens, Truth
-from experiments.engine.bounds import compare
-from experiments.engine.workers import here
 from experiments.following import depth_error, models, regimes, shortcut
 from experiments.following.mounted import (
     MOUNTED_DEG,
@@ -154,7 +151,6 @@ def test_the_regime_reaches_as_far_as_the_full_model_is_five_times_better():
     assert regimes.regime(rows, "seen") == (5.0, 50.0)
     summary = models.summarise(rows)
     assert models.missed(summary) == []
-    assert "1 / depth|) of 5 to 50" in models.describe(models.SETTINGS, summary)
     none = models.missed(models.summarise(error_rows({5.0: 4.0, 10.0: 20.0})))
     assert none == [f"{c}: full model 5 times better than {o}" for c in models.CONDITIONS for o in models.OPPONENTS]
 
@@ -207,13 +203,13 @@ def test_depths_are_measured_by_the_size():
 
 def test_the_nearest_targets_all_have_a_depth():
     settings = replace(depth_error.SETTINGS, depths=(depth_error.NEAREST_M,), baselines=(0.4,))
-    rows = [row for seed in range(10) for row in depth_error.one(None, settings, seed)]
+    rows = [row for seed in range(10) for row in depth_error.one(settings, seed)]
     assert all(math.isfinite(row["width"]) for row in rows)
 
 
 def test_first_order_agrees_with_monte_carlo():
     settings = replace(depth_error.SETTINGS, baselines=(0.4,), depths=(10.0,), targets=100, scatter=0.02, wrong=0.01)
-    rows = {row["cause"]: row for row in depth_error.one(None, settings, 0)}
+    rows = {row["cause"]: row for row in depth_error.one(settings, 0)}
     for cause in depth_error.CAUSES:  # 100 normal numbers tell their rms to 7 %
         assert rows[cause]["reached_deg"] == pytest.approx(rows[cause]["first_order_deg"], rel=0.25), cause
     summary = depth_error.summarise(list(rows.values()))
@@ -225,7 +221,7 @@ def test_first_order_agrees_with_monte_carlo():
 
 def test_the_exact_range_is_exact_and_the_shortcut_worse_the_farther_off_the_axis():
     settings = replace(shortcut.SETTINGS, depths=(10.0,), grid=(5, 3), near=8, rigs=("mounted",))
-    rows = shortcut.one(None, settings, 0)
+    rows = shortcut.one(settings, 0)
     assert len(rows) == 15 + 8
     assert max(row["exact_deg"] for row in rows) < shortcut.ROUNDING_DEG
     by_angle = sorted(rows, key=lambda row: row["off_axis_deg"])
@@ -235,8 +231,6 @@ def test_the_exact_range_is_exact_and_the_shortcut_worse_the_farther_off_the_axi
     assert shortcut.missed(summary) == []
     found = summary["mounted"]["paper-table"]
     assert found["near the axis"]["10 m"]["deg"] < found["whole view"]["10 m"]["deg"]
-    text = shortcut.describe(settings, summary)
-    assert f"({found['whole view']['10 m']['deg_low']:.2g} to " in text
     wrong = shortcut.missed(
         shortcut.summarise([*rows, rows[0] | {"exact_deg": 0.1}, rows[0] | {"exact_deg": math.nan}])
     )
@@ -246,14 +240,12 @@ def test_the_exact_range_is_exact_and_the_shortcut_worse_the_farther_off_the_axi
 def test_a_grid_that_has_no_target_at_20_degrees_tells_nothing_of_them():
     """Its corners are 25 degrees and more off the axis."""
     settings = replace(shortcut.SETTINGS, depths=(10.0,), grid=(2, 2), near=8, rigs=("mounted",))
-    rows = shortcut.one(None, settings, 0)
+    rows = shortcut.one(settings, 0)
     summary = shortcut.summarise(rows)
     found = summary["mounted"]["paper-table"]
     assert math.isnan(found["at 20 degrees"]["all"]["deg"])
     assert found["whole view"]["10 m"]["deg"] > 1.0
     assert shortcut.missed(summary) == []
-    line = next(line for line in shortcut.describe(settings, summary).splitlines() if "at 20 degrees, 10 m" in line)
-    assert line.split()[-6:] == ["-"] * 6
     shortcut.plot(rows, Figure())
 
 
@@ -274,7 +266,7 @@ def test_the_worked_examples_rig_errs_as_the_worked_example_does():
     assert truth.gamma.apply(x)[0] == pytest.approx([0.811, 0.563, 10.464])
     reach = shortcut.Reach(shortcut.ANYWHERE, shortcut.ANYWHERE, (693.0, 7155.0))
     for method, px in (("paper-table", 33.5), ("paper-example", 2.6)):
-        q = np.array([shortcut._aimed(exact_calibration(truth), x[0], reach, method)])
+        q = np.array([shortcut.aimed(exact_calibration(truth), x[0], reach, method)])
         assert 7155 * math.tan(looking_off(truth, x, q)[0]) == pytest.approx(px, abs=0.1)
 
 
@@ -295,7 +287,7 @@ def test_a_calibration_is_to_err_as_theory_and_it_itself_have_it():
     right = {"exponent_noise": 1.0, "exponent_placements": -0.6, "reached_over_predicted": 1.0}
     assert calibration_budget.missed(right) == []
     said = calibration_budget.missed(right | {"exponent_noise": 0.5})
-    assert said == ["exponent_noise is 0.50, not 0.75 to 1.25"]
+    assert [text.partition(":")[0] for text in said] == ["exponent_noise"]
     assert calibration_budget.missed(right | {"exponent_noise": math.nan}) == []  # one noise tells of none
 
 
@@ -307,35 +299,6 @@ def test_a_calibration_of_less_noise_points_better():
         "",
         base=replace(calibration_budget.SETTINGS, targets=20),
     )
-    fine, coarse = calibration_budget.one(None, settings, 0)
+    fine, coarse = calibration_budget.one(settings, 0)
     assert fine["reached_px"] < 0.2 * coarse["reached_px"]
     assert (fine["placements"], fine["poses"]) == (6, 24)
-
-
-@pytest.mark.parametrize(("module", "given", "said"), [
-    (models, {"baselines": []}, "baselines: at least one number is needed"),
-    (depth_error, {"depths": [5.0, -1.0]}, "depths: -1 is not above 0"),
-    (shortcut, {"grid": [1, 5]}, "grid: 1 is not above 1"),
-    (calibration_budget, {"placements": [0]}, "placements: 0 is not above 0"),
-    (depth_error, {"depths": [1.9]}, "depths: 1.9 is below 2"),
-    (depth_error, {"wrong": 0.0}, "wrong: 0 is no error"),
-])  # fmt: skip
-def test_settings_that_cannot_be_are_refused(module, given, said):
-    settings = module.EXPERIMENT.settings
-    with pytest.raises(ConfigError, match=said):
-        validate(type(settings), given, module.EXPERIMENT.name, base=settings)
-
-
-BOUNDED = (shortcut, models, depth_error, calibration_budget)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("module", BOUNDED, ids=lambda module: module.EXPERIMENT.name)
-def test_no_figure_gets_worse(module):
-    experiment = module.EXPERIMENT
-    summary = experiment.summarise(experiment.run(experiment.quick, engine=here))
-    assert not experiment.missed or not experiment.missed(summary)
-    bounds = compare(experiment, summary)
-    assert bounds
-    for bound in bounds:
-        assert bound.kept, f"{bound.name} is {bound.reached}, not {bound.text}"

@@ -1,6 +1,8 @@
 """The paper's own way to follow, and experiments on a rig of one's own."""
 
+import json
 import pickle
+from argparse import Namespace
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +15,9 @@ from cotarget.pantilt import shortcut
 from cotarget.pipeline import FollowSettings
 from cotarget.sim.world import SimWorld
 from experiments.calibration import pointing
-from experiments.engine.cases import choose
-from experiments.engine.results import identity
+from experiments.command import choose
+from experiments.engine import identity, known_experiments
+from experiments.following.field import calibrated
 from experiments.paper import fig4_book, table2_table3
 from experiments.paper.paper_loop import follow_as_the_paper
 
@@ -72,21 +75,14 @@ def own(tmp_path):
 
 def test_an_experiment_is_tried_with_a_rig_of_ones_own(own):
     for module in (fig4_book, pointing, table2_table3):
-        name = module.EXPERIMENT.name
-        (case,) = choose({name: lambda module=module: module.EXPERIMENT}, [name], changes=[f"{name}.rig={own}"])
+        name = module.__name__.rpartition(".")[2]
+        given = Namespace(names=[name], set=[f"{name}.rig={own}"], quick=True, seeds=None, seed_base=None)
+        (case,) = choose(known_experiments(), given)
         config = case.settings.config("indoor", ("book",), 7)
         assert (config.sim.scene, config.sim.targets, config.sim.seed) == ("indoor", ("book",), 7)
         assert config.sim.T_zoom0_fixed.translation.tolist() == [-0.8, 0.1, 0.2]
         assert config.sim.fixed.focal_px == (600, 601)
-        assert not case.has_bounds
-        before = identity(case.settings)
-        assert before["rig_toml"] == own.read_text()
-
-
-def test_results_of_another_rig_in_the_same_file_are_told_apart(own):
-    settings = pointing.Settings(rig=str(own))
-    own.write_text("[sim.fixed]\nfocal_px = [500, 500]\n")
-    assert identity(pointing.Settings(rig=str(own))) != identity(settings)
+        assert json.loads(identity(case))["settings"]["rig_toml"] == own.read_text()
 
 
 def test_a_worker_has_the_rig_as_it_was_read_wherever_it_is(tmp_path, own, monkeypatch):
@@ -94,22 +90,17 @@ def test_a_worker_has_the_rig_as_it_was_read_wherever_it_is(tmp_path, own, monke
     own.write_text(own.read_text() + "[targets.book]\ntemplate = 'book.png'\n", encoding="utf-8-sig")
     monkeypatch.chdir(tmp_path)
     settings = replace(fig4_book.SETTINGS, rig="rig.toml", calibrated=False)
-    before = identity(settings)
-    assert before.keys() == identity(fig4_book.SETTINGS).keys()  # no folder among them
-    make, given = fig4_book.EXPERIMENT.shares(settings)
-    sent = pickle.dumps((settings, make, given))
+    sent = pickle.dumps(settings)
     own.write_text("[sim.fixed]\nfocal_px = [500, 500]\n")
+    assert replace(settings, rig_toml="") != settings  # results of another rig in the same file are told apart
+    own.unlink()
     (elsewhere := tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(elsewhere)
-    settings, make, given = pickle.loads(sent)
-    for config in (settings.config("indoor", ("book",), 7), given[-1].config("indoor", ("book",), 7)):
-        assert config.sim.fixed.focal_px == (600, 601)
-        assert config.target("book").template == tmp_path / "book.png"
-    assert make(*given).fixed.lens.focal_px == (600, 601)
-    assert fig4_book.EXPERIMENT.prepare(settings).fixed.lens.focal_px == (600, 601)
-    assert identity(settings) == before
-    own.unlink()
-    assert settings.config("indoor", (), 7).sim.fixed.focal_px == (600, 601)
+    settings = pickle.loads(sent)
+    config = settings.config("indoor", ("book",), 7)
+    assert config.sim.fixed.focal_px == (600, 601)
+    assert config.target("book").template == tmp_path / "book.png"
+    assert calibrated(settings).fixed.lens.focal_px == (600, 601)
 
 
 def test_wrong_rigs_are_refused_in_one_line(tmp_path, own):

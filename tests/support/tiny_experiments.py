@@ -1,5 +1,6 @@
 """Experiments that take no time, for tests of what runs them; as a program, the command that does."""
 
+import contextlib
 import os
 import sys
 from dataclasses import dataclass, replace
@@ -7,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.engine.harness import Experiment, Preparation, Settings, seeds_of
-from experiments.engine.results import code_version
+from experiments.engine import Count, Experiment, Pictured, Settings, perform
 
 SIZE = 300  # of matrices that are large enough for linear algebra to share its sums among threads
 
@@ -17,12 +17,13 @@ SIZE = 300  # of matrices that are large enough for linear algebra to share its 
 class TinySettings(Settings):
     """Where notes are left of who did what, and what the figures are made of."""
 
-    seeds: int = 4
+    seeds: Count = 4
     notes: str = ""
     factor: float = 1.0
     wrong: tuple[int, ...] = ()
     fatal: tuple[int, ...] = ()
     gated: tuple[int, ...] = ()
+    kinds: tuple[str, ...] = ("odd", "even")
 
 
 def note(settings, text):
@@ -42,8 +43,8 @@ def pids(folder, what=""):
     return {int(line.rpartition(" ")[2]) for line in lines if line.startswith(what)}
 
 
-def one(shared, settings, seed):
-    """A number that depends on the seed, and on how sums of many numbers are formed."""
+def one(settings, seed):
+    """A number that depends on the seed, and on how sums of many numbers are formed; a picture of the first seed."""
     note(settings, f"job {seed}")
     if seed in settings.wrong and not (Path(settings.notes) / "mended").exists():
         raise ValueError(f"seed {seed}\nis wrong")
@@ -53,29 +54,12 @@ def one(shared, settings, seed):
         (Path(settings.notes) / "gate").read_text()  # as a pipe, this waits for ever
     matrix = np.random.default_rng(seed).normal(size=(SIZE, SIZE))
     value = float(np.linalg.svd(matrix @ matrix.T, compute_uv=False)[-1])
-    row = {"seed": seed, "value": settings.factor * seed, "sum": value, "shared": shared, "odd": np.bool_(seed % 2)}
-    return [row, {"seed": seed, "value": float("nan")}]
+    rows = [{"seed": seed, "value": settings.factor * seed, "sum": value, "odd": np.bool_(seed % 2), "none": None}]
+    rows.append({"seed": seed, "value": float("nan")})
+    return Pictured(rows, {"drawn": b"PNG"}) if seed == settings.seed_base else rows
 
 
-def prepare(notes):
-    note(TinySettings(notes=notes), "prepared")
-    return "given to all"
-
-
-def for_notes(settings):
-    return (settings.notes,)
-
-
-def knows_its_code(_):
-    """Whether this process knew which code it has before it was told what to do."""
-    return code_version.cache_info().currsize == 1
-
-
-def prepare_in_vain(settings):
-    raise OSError("nothing to\nshare")
-
-
-def alone(shared, settings, seed):
+def timed(settings, seed):
     note(settings, f"alone {seed}")
     if seed in settings.fatal:
         os._exit(3)
@@ -85,10 +69,6 @@ def alone(shared, settings, seed):
 def summarise(rows):
     values = [row["value"] for row in rows if row["value"] == row["value"]]
     return {"total": sum(values), "by": {"worst": max(values)}, "rows": len(rows)}
-
-
-def describe(settings, summary):
-    return f"{seeds_of(settings)}: <total> {summary['total']:g}"
 
 
 def plot(rows, figure):
@@ -102,17 +82,25 @@ def missed(summary):
 
 SETTINGS = TinySettings()
 QUICK = replace(SETTINGS, seeds=2)
-TINY = Experiment("tiny", "Adds up.", SETTINGS, QUICK, one, summarise, describe, plot, missed)
-SHARING = replace(
-    TINY, name="sharing", purpose="Shares.", prepare=Preparation(prepare, for_notes), cost_s=5.0, missed=None
-)
-VAIN = replace(TINY, name="vain", purpose="Cannot be prepared.", prepare=prepare_in_vain)
-ALONE = replace(TINY, name="alone", purpose="Takes the time.", one=alone, alone=True, plot=None)
+TINY = Experiment("tiny", "Adds up.", SETTINGS, QUICK, one, summarise, missed, plot=plot)
+ALONE = replace(TINY, name="alone", purpose="Takes the time.", one=timed, alone=True, plot=None)
 LACKING = replace(TINY, name="lacking", purpose="Lacks something.", needs=lambda _: "needs the moon")
+KNOWN = {each.name: lambda each=each: each for each in (TINY, ALONE, LACKING)}
 
-KNOWN = {each.name: lambda each=each: each for each in (TINY, SHARING, VAIN, ALONE, LACKING)}
+
+def here(jobs):
+    """Run jobs one after the other in this process."""
+    for job in jobs:
+        yield job, perform(job.case.experiment.one, job.case.settings, job.number)
+
+
+@contextlib.contextmanager
+def here_together(processes, scheduler):
+    """Stand for a cluster, whose start takes seconds."""
+    yield here
+
 
 if __name__ == "__main__":
-    from experiments.engine.command import main
+    from experiments.command import main
 
     sys.exit(main(known=KNOWN))

@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from annotated_types import Ge
 
 from cotarget.calibration import View
+from cotarget.calibration.initialization import FEWEST_VIEWS
 from cotarget.geometry import Array, Rotation
 from experiments.calibration.synthetic.aims import aimed
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Stop, Truth, undistorted
@@ -24,6 +27,8 @@ LOOKS_DRAWN = 80  # head poses drawn, of which those far apart are chosen
 FEWEST_CORNERS = 12  # least corners of a board in partial view, at a longer focal length
 TRIES = 200  # head poses drawn per placement
 PLACEMENT_TRIES = 100_000
+Boards = Annotated[int, Ge(FEWEST_VIEWS)]  # as many placements as determine a camera's intrinsics
+Looks = Annotated[int, Ge(2)]  # as many head poses per placement as determine the zoom camera's pose on the head
 
 
 def synthetic_views(

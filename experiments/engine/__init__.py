@@ -1,1 +1,0 @@
-"""Engine of the experiments: run seeds, store rows, compare figures with bounds, write the report."""

@@ -1,0 +1,188 @@
+"""Statistics of figures over the seeds, as numbers, text and plots; shared by the experiments."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.engine import Row
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from cotarget.geometry import Array
+
+SPREAD = ("median", "least", "largest")
+WHOLE = 1000.0  # numbers from this on are printed without decimals
+BESIDE = 0.12  # offset of the values to the right of the median
+Range = tuple[float, float]
+
+
+# Numbers
+
+
+def rms(values: "Iterable[float] | Array") -> float:
+    """Compute the root mean square without nan values."""
+    squared = np.square(np.array(list(values), dtype=float))
+    return float(np.sqrt(np.nanmean(squared))) if np.isfinite(squared).any() else math.nan
+
+
+def spread(values: Iterable[float | None]) -> dict[str, float]:
+    """Give median, least and largest of the values that are there; nan where none is."""
+    told = [float(value) for value in values if value is not None]
+    three = (np.median(told), min(told), max(told)) if told else (math.nan,) * 3
+    return dict(zip(SPREAD, map(float, three), strict=True))
+
+
+def mean_of(values: Iterable[float]) -> tuple[float, float]:
+    """Give mean of values and its standard error; nan of no value, and an error of nan of one."""
+    told = list(values)
+    error = float(np.std(told, ddof=1) / math.sqrt(len(told))) if len(told) > 1 else math.nan
+    return (float(np.mean(told)) if told else math.nan), error
+
+
+def grouped(rows: Iterable[Row], *keys: str) -> dict[Any, list[Row]]:
+    """Group rows by the value of a column, or by the values of several, in the order of first appearance."""
+    found: dict[Any, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row[keys[0]] if len(keys) == 1 else tuple(row[key] for key in keys), []).append(row)
+    return found
+
+
+def spreads(rows: Iterable[Row], by: str, figures: Iterable[str]) -> dict[Any, dict[str, dict[str, float]]]:
+    """Give the spread of each figure, by the value of a column."""
+    keys = list(figures)
+    return {name: {key: spread(row[key] for row in mine) for key in keys} for name, mine in grouped(rows, by).items()}
+
+
+def spread_columns(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Give the spread of each column of numbers; the summary of an experiment without its own."""
+    numbers = [
+        key for key, value in rows[0].items() if isinstance(value, float) or (type(value) is int and key != "seed")
+    ]
+    return {key: spread(row[key] for row in rows) for key in numbers}
+
+
+def outside(figures: Mapping[str, Any], wanted: Mapping[str, Range], name: str = "") -> list[str]:
+    """List the figures whose value or median is not in the wanted range, with a name in front."""
+    missed = []
+    for key, (low, high) in wanted.items():
+        value: Any = figures[key]
+        if isinstance(value, Mapping):
+            value = value["median"]
+        if not low <= value <= high:
+            missed.append(f"{name}{name and ': '}{key}: {number(value)}, not {low:g} to {high:g}")
+    return missed
+
+
+def leaves(tree: Any, trail: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Iterate over all values of nested dictionaries, with their paths."""
+    if not isinstance(tree, Mapping):
+        yield trail, tree
+        return
+    for key, value in tree.items():
+        yield from leaves(value, (*trail, str(key)))
+
+
+def plain(value: Any) -> Any:
+    """Convert a value for JSON; numbers that are not finite become null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# Text
+
+
+def number(value: Any) -> str:
+    """Format a number with three significant digits; a spread as its median (least to largest)."""
+    if isinstance(value, Mapping):
+        median, least, largest = (number(value[key]) for key in SPREAD)
+        return median if least == largest else f"{median} ({least} to {largest})"
+    if isinstance(value, float | np.floating):
+        return "-" if math.isnan(value) else format(value, ".0f" if abs(float(value)) >= WHOLE else ".3g")
+    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def as_text(figures: Mapping[str, Any]) -> str:
+    """Format nested figures as tables, one for each depth of nesting.
+
+    The last name of a figure makes the column, the others the line, or the other way round where that is narrower.
+    """
+    import pandas as pd
+
+    tables: dict[int, dict[str, dict[str, str]]] = {}
+    for trail, value in _cells(figures, ()):
+        line = tables.setdefault(len(trail), {}).setdefault(" / ".join(trail[:-1]), {})
+        line[trail[-1]] = number(value)
+    texts = []
+    for lines in tables.values():
+        frame = pd.DataFrame.from_dict(lines, orient="index").fillna("")
+        texts.append((frame if len(frame) >= len(frame.columns) else frame.T).to_string())
+    return "\n\n".join(texts)
+
+
+def _cells(tree: Mapping[str, Any], trail: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Iterate over figures with their paths; a spread is one figure."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and not set(SPREAD) <= set(value):
+            yield from _cells(value, (*trail, str(key)))
+        else:
+            yield (*trail, str(key)), value
+
+
+def columns(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
+    """Format lines under a head."""
+    import pandas as pd
+
+    return str(pd.DataFrame([list(map(number, line)) for line in lines], columns=list(head)).to_string(index=False))
+
+
+# Plots
+
+
+def points(ax: "Axes", at: float, values: Iterable[float | None], **how: Any) -> None:
+    """Draw the values that are there: their median with a bar from least to largest, and each value beside it.
+
+    Args:
+        ax: axes to draw in.
+        at: place on the x axis.
+        values: values to draw.
+        how: colour and label, as for matplotlib.
+    """
+    told = [value for value in values if value is not None]
+    if told:
+        found = spread(told)
+        reach = [[found["median"] - found["least"]], [found["largest"] - found["median"]]]
+        bar = ax.errorbar([at], [found["median"]], yerr=reach, fmt="_", markersize=12, capsize=3, **how)
+        ax.plot([at + BESIDE] * len(told), told, ".", color=bar.lines[0].get_color(), alpha=0.5)
+
+
+def bars(ax: "Axes", at: Sequence[float], values: Sequence[Sequence[float]], width: float, **how: Any) -> None:
+    """Draw the mean of each group of values as a bar with its standard error, and each value as a point on it.
+
+    Args:
+        ax: axes to draw in.
+        at: place of each group on the x axis.
+        values: values of each group.
+        width: width of a bar.
+        how: colour and label, as for matplotlib.
+    """
+    means, errors = np.array([mean_of(each) for each in values]).T
+    ax.bar(at, means, width, yerr=np.nan_to_num(errors), capsize=3, **how)
+    for place, each in zip(at, values, strict=True):
+        ax.plot([place] * len(each), each, ".", ms=3, color="k")
+
+
+def quartiles(ax: "Axes", rows: Iterable[Row], x: str, y: str, **how: Any) -> list[Any]:
+    """Draw the median of a column over another one, with bars of its quartiles; give the places on the x axis."""
+    found = dict(sorted(grouped(rows, x).items()))
+    low, mid, high = np.array([np.percentile([row[y] for row in mine], [25, 50, 75]) for mine in found.values()]).T
+    style: dict[str, Any] = {"fmt": "o", "ms": 4, "capsize": 2, **how}
+    ax.errorbar(list(found), mid, [mid - low, high - mid], **style)
+    return list(found)

@@ -1,0 +1,465 @@
+"""Sweeps: every seed once, whatever happens to the others or to the program; the same rows whoever does them."""
+
+import contextlib
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cotarget.errors import ConfigError
+from cotarget.sim.render import opengl
+from experiments.command import choose, main
+from experiments.engine import (
+    ONE_THREAD,
+    TALLY,
+    code_version,
+    csv_of,
+    known_experiments,
+    on_dask,
+    perform,
+    read_rows,
+)
+from experiments.report import Bound, compare
+from experiments.tables import as_text, number, outside, rms, spread, spread_columns
+from tests.support.tiny_experiments import KNOWN, TINY, here, here_together, notes, pids
+
+DEADLINE_S = 120.0  # for a program to come as far as it is waited for
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def run(tmp_path, capsys, monkeypatch):
+    """The command on tiny experiments, in this process; exit status, what it said, and what it complained of."""
+    monkeypatch.setattr("cotarget.cli.common.REMARK_S", math.inf)  # a busy machine is no complaint
+
+    def typed(*arguments, out="out", known=KNOWN, apart=here):
+        status = main([*arguments, "--out", str(tmp_path / out)], known, tmp_path, here_together, apart)
+        told = capsys.readouterr()
+        return status, told.out, told.err
+
+    return typed
+
+
+def noted(tmp_path, *names):
+    return [argument for name in names for argument in ("--set", f"{name}.notes='{tmp_path}'")]
+
+
+def cases(*names, changes=(), known=KNOWN, quick=False, seeds=None, seed_base=None, folder=Path("out")):
+    return choose(known, Namespace(names=names, set=changes, quick=quick, seeds=seeds, seed_base=seed_base), folder)
+
+
+# ---------------------------------------------------------------- what is done
+def test_each_seed_once_and_timings_last(run, tmp_path):
+    status, told, complaints = run("alone", "tiny", *noted(tmp_path, "tiny", "alone"))
+    assert (status, complaints) == (0, "")
+    assert notes(tmp_path) == [*(f"job {seed}" for seed in range(4)), *(f"alone {seed}" for seed in range(4))]
+    (folder,) = (path for path in (tmp_path / "out").iterdir() if path.name.startswith("tiny"))
+    (first, second) = read_rows(folder / "rows" / "000003.csv")
+    assert (first["seed"], first["value"], first["odd"], first["none"]) == (3, 3.0, True, None)
+    assert math.isnan(second["value"])
+    assert second["odd"] is None
+    assert (folder / "drawn.png").read_bytes() == b"PNG"
+    assert cv2.imread(str(folder / "figure.png")) is not None
+    assert len(read_rows(folder / "rows.csv")) == 8
+    result = json.loads((folder / "result.json").read_text())
+    assert result["summary"] == {"total": 6.0, "by": {"worst": 3.0}, "rows": 8}
+    assert result["settings"]["factor"] == 1.0
+    (log, *_) = read_rows(folder / "seeds.csv")
+    assert (log["version"], log["failed"]) == (code_version(), None)
+    assert str(tmp_path / "out" / "report.html") in told
+
+
+def test_more_seeds_are_added_to_those_that_are_there(run, tmp_path):
+    assert run("tiny", *noted(tmp_path, "tiny"), "--seeds", "2")[0] == 0
+    assert run("tiny", *noted(tmp_path, "tiny"), "--seeds", "3")[0] == 0
+    assert notes(tmp_path) == ["job 0", "job 1", "job 2"]
+    status, told, _ = run("tiny", *noted(tmp_path, "tiny"), "--seeds", "1", "--report")
+    assert status == 0
+    assert len(notes(tmp_path)) == 3
+    assert "total" in told
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "--seeds 1" in page
+    assert "--report" not in page
+
+
+def test_settings_can_be_swept(run, tmp_path):
+    assert run("tiny", "--seeds", "2", "--set", "tiny.factor=2", "--set", "tiny.factor=3.5")[0] == 0
+    values = [read_rows(tmp_path / "out" / f"tiny,factor={f}" / "rows" / "000001.csv")[0]["value"] for f in (2, 3.5)]
+    assert values == [2.0, 3.5]
+    assert "Settings compared" in (tmp_path / "out" / "report.html").read_text()
+    found = cases("tiny", changes=["tiny.factor=1", "tiny.wrong=[1]", "tiny.factor=2", "tiny.wrong=[]"])
+    assert [(case.settings.factor, case.settings.wrong) for case in found] == [
+        (1.0, (1,)), (1.0, ()), (2.0, (1,)), (2.0, ())
+    ]  # fmt: skip
+    assert len({case.folder for case in found}) == 4
+    assert len(cases("tiny", changes=["tiny.factor=0.1", "tiny.factor=1e-1", "tiny.factor=0.10"])) == 1
+
+
+TEXTS = st.sampled_from(["book", "a, b", "1 m"])
+VALUES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | TEXTS
+
+
+@given(st.lists(st.fixed_dictionaries({"a": VALUES, "b": VALUES})))
+@settings(derandomize=True, database=None, deadline=None)
+def test_rows_are_read_as_they_were_written(tmp_path_factory, rows):
+    path = tmp_path_factory.mktemp("rows") / "rows.csv"
+    path.write_bytes(csv_of(rows))
+    read = read_rows(path)
+    assert read == rows
+    assert [[type(row[key]) for key in "ab"] for row in read] == [[type(row[key]) for key in "ab"] for row in rows]
+
+
+# ---------------------------------------------------------------- what goes wrong
+def test_a_seed_that_fails_is_recorded_and_the_rest_goes_on(run, tmp_path):
+    wrong = ("tiny", *noted(tmp_path, "tiny"), "--set", "tiny.wrong=[1]")
+    status, _, complaints = run(*wrong)
+    assert (status, complaints.count("\n")) == (1, 1)
+    assert "seed 1 failed: ValueError: seed 1 is wrong" in complaints
+    (folder,) = (path for path in (tmp_path / "out").iterdir() if path.is_dir())
+    assert json.loads((folder / "result.json").read_text())["summary"]["total"] == 5.0  # 0 + 2 + 3
+    assert "ValueError: seed 1" in (folder / "000001.txt").read_text()
+    assert "ValueError: seed 1 is wrong" in (tmp_path / "out" / "report.html").read_text()
+    (tmp_path / "mended").touch()
+    assert run(*wrong)[0] == 0
+    assert notes(tmp_path)[4:] == ["job 1"]
+    assert not (folder / "000001.txt").exists()
+
+
+def test_figures_that_cannot_be_made_are_named(run):
+    status, told, _ = run("tiny", known={"tiny": lambda: replace(TINY, summarise=min)})
+    assert (status, "the rows give no figures: TypeError" in told) == (1, True)
+
+
+def test_a_goal_that_is_missed_fails_but_not_a_quick_run(run):
+    status, told, _ = run("tiny", "--set", "tiny.factor=50", "--seeds", "3")
+    assert (status, "missed: total: too much" in told) == (1, True)
+    assert run("tiny", "--set", "tiny.factor=50", "--seeds", "3", "--quick", out="quick")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["tyni"], "tyni"),
+        (["tiny", "--set", "tiny.facto=1"], "tiny.facto"),
+        (["tiny", "--set", "tiny.factor=high"], "tiny.factor"),
+        (["tiny", "--set", "tiny.seeds=0"], "tiny.seeds"),
+        (["tiny", "--set", "tiny.kinds=['none']"], "tiny.kinds"),
+        (["tiny", "--set", "tiny.kinds=[]"], "tiny.kinds"),
+        (["tiny", "--set", "alone.factor=1"], "alone"),
+        (["tiny", "--set", "factor"], "factor"),
+        (["lacking"], "lacking"),
+        (["tiny", "--update-expected"], "--update-expected"),
+        (["tiny", "--report", "--fresh"], "--report"),
+        (["tiny", "--report"], "--report"),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_mistakes_end_in_one_line_before_any_work(run, tmp_path, arguments, named):
+    status, told, complaints = run(*arguments)
+    assert (status, told, complaints.count("\n")) == (1, "", 1)
+    assert named in complaints
+    assert not (tmp_path / "out" / "tiny").exists()
+
+
+def test_a_folder_that_cannot_be_made(run, tmp_path):
+    (tmp_path / "file").touch()
+    status, _, complaints = run("tiny", out="file")
+    assert (status, complaints.count("\n"), str(tmp_path / "file") in complaints) == (1, 1, True)
+
+
+def test_what_cannot_be_done_is_left_out_unless_it_is_named(run, tmp_path):
+    status, told, _ = run("--seeds", "1")
+    assert (status, "not run: needs the moon" in told) == (0, True)
+    assert "needs the moon" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_results_of_other_settings_or_other_code_are_refused(run, tmp_path):
+    assert run("tiny", "--seeds", "1")[0] == 0
+    status, _, complaints = run("tiny", "--seeds", "1", "--seed-base", "5")
+    assert (status, complaints.count("\n"), "settings.json" in complaints) == (1, 1, True)
+    log = tmp_path / "out" / "tiny" / "seeds.csv"
+    log.write_text(log.read_text().replace(code_version(), "0.0.9+1.2"))
+    status, _, complaints = run("tiny", "--seeds", "2")
+    assert (status, complaints.count("\n"), "0.0.9+1.2" in complaints) == (1, 1, True)
+    status, told, _ = run("tiny", "--seeds", "2", "--any-code")
+    assert (status, "0.0.9+1.2" in told) == (0, True)
+    assert run("tiny", "--seeds", "2", "--fresh")[0] == 0
+    assert "0.0.9" not in log.read_text()
+
+
+def test_a_worker_with_other_code_ends_the_run(run, tmp_path):
+    def changed(jobs):
+        for i, (job, done) in enumerate(here(jobs)):
+            yield job, replace(done, version="0.1.0+1.2") if i else done
+
+    status, _, complaints = run("alone", "--fresh", apart=changed)
+    assert (status, complaints.count("\n")) == (1, 1)
+    assert "0.1.0+1.2" in complaints
+    assert "1 of 4 seeds are done and kept" in complaints
+    assert complaints.endswith("the same command without --fresh goes on\n")
+    assert run("alone")[0] == 0
+
+
+# ---------------------------------------------------------------- figures and bounds
+def test_bounds_only_tighten(run, tmp_path):
+    path = tmp_path / "tiny.json"
+    path.write_text('{"total": 0.5, "by": {"worst": {"at_most": 3.0}}, "rows": {"at_least": null}}')
+    status, told, _ = run("tiny", "--quick", "--update-expected")
+    assert (status, "by / worst" in told) == (1, True)
+    assert json.loads(path.read_text()) == {"total": 0.5, "by": {"worst": {"at_most": 1.0}}, "rows": {"at_least": 4.0}}
+    (tmp_path / "alone.json").write_text('{"total": 9.0}')
+    assert run("alone", "--quick", "--update-expected")[0] == 0
+    assert json.loads((tmp_path / "alone.json").read_text()) == {"total": 9.0}  # of times none is written
+
+
+@pytest.mark.parametrize(
+    ("kind", "bound", "good", "bad"),
+    [
+        ("at_most", 0.02, 0.0219, 0.0221),
+        ("at_least", 0.88, 0.81, 0.79),
+        ("at_most", -1.0, -0.95, -0.9),
+        ("at_least", -1.0, -1.05, -1.15),
+        ("within", (0.85, 1.15), 1.14, 1.16),
+        ("within", (0.85, 1.15), 0.86, 0.84),
+        ("at_most", None, 5.0, None),
+        ("at_most", 0.0, 0.0, math.nan),
+    ],
+)
+def test_a_bound_allows_a_tenth(kind, bound, good, bad):
+    assert Bound("", kind, bound, good).kept
+    assert not Bound("", kind, bound, bad).kept
+
+
+def test_a_bound_whose_figure_is_gone_is_broken(tmp_path):
+    path = tmp_path / "tiny.json"
+    path.write_text('{"total": 1.0, "other": {"figure": 1.0}, "by": 1.0}')
+    found = compare("tiny", {"total": 1.09, "by": float("nan")}, tmp_path)
+    assert [(bound.name, bound.kept) for bound in found] == [("total", True), ("other / figure", False), ("by", False)]
+    for wrong in ("{", '{"total": "low"}', '{"total": {"within": [1]}}'):
+        path.write_text(wrong)
+        with pytest.raises(ConfigError, match=r"tiny\.json"):
+            compare("tiny", {}, tmp_path)
+
+
+def test_figures_as_tables():
+    one = {"median": 1.0, "least": 0.5, "largest": 1234.5}
+    text = as_text({"book": {"yield": one, "size": 2}, "bird": {"yield": dict.fromkeys(one, 0.25), "size": math.nan}})
+    lines = [line.split() for line in text.splitlines()]
+    assert lines == [["yield", "size"], ["book", "1", "(0.5", "to", "1234)", "2"], ["bird", "0.25", "-"]]
+    assert as_text({"a": 1, "b": [2, 3]}).split() == ["a", "1", "b", "2,", "3"]
+
+
+def test_statistics():
+    assert rms([3.0, math.nan, 4.0]) == pytest.approx(math.sqrt(12.5))
+    assert math.isnan(rms([]))
+    assert spread([3, None, 1.0, 2.0]) == {"median": 2.0, "least": 1.0, "largest": 3.0}
+    assert math.isnan(spread([])["median"])
+    rows = [{"seed": 1, "a": 1.0, "b": "x"}, {"seed": 2, "a": 3.0, "b": "y"}]
+    assert spread_columns(rows) == {"a": spread([1.0, 3.0])}
+    assert outside({"a": 0.5, "b": {"median": 2.0}}, {"a": (0.0, 0.4), "b": (1.0, 2.0)}, "book") == [
+        "book: a: 0.5, not 0 to 0.4"
+    ]
+    assert number(np.float32(0.5)) == "0.5"
+
+
+# ---------------------------------------------------------------- what a seed takes
+def test_what_a_seed_takes_is_counted():
+    assert TALLY == opengl.TALLY
+
+    def one(settings, seed):
+        subprocess.run(f'printf ... >> "${TALLY}"', shell=True, check=True)  # as drawing does, in any process
+        end = time.process_time() + 0.02
+        while time.process_time() < end:
+            pass
+        return [{"seed": 0, "value": np.float32(0.5)}]
+
+    done = perform(one, None, 0)
+    assert (done.renders, done.failed) == (3, "")
+    assert done.cpu_s >= 0.02
+    assert TALLY not in os.environ
+    assert "a row holds a set" in perform(lambda *_: [{"seed": {0}}], None, 0).failed
+
+
+@pytest.mark.render
+def test_each_picture_is_tallied(tmp_path, monkeypatch):
+    monkeypatch.setenv(opengl.TALLY, str(tmp_path / "tally"))
+    model = opengl.mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    canvas = opengl.Canvas(model, (8, 8), shadows=False)
+    for _ in range(2):
+        canvas.draw(np.zeros(3), np.eye(3), (-1.0, 1.0, -1.0, 1.0), (8, 8))
+    canvas.close()
+    assert (tmp_path / "tally").stat().st_size == 2
+
+
+# ---------------------------------------------------------------- workers
+@pytest.fixture
+def started(tmp_path):
+    """The command as a program of its own, with seeds that wait for ever once the others are done."""
+    arguments = [*noted(tmp_path, "tiny"), "--set", "tiny.gated=[2, 3]", "--out", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "tests.support.tiny_experiments", "tiny", "--processes", "2", *arguments]
+    os.mkfifo(tmp_path / "gate")
+    programs = []
+
+    def start():
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        programs.append(subprocess.Popen(command, cwd=ROOT, start_new_session=True, env=environment, **pipes))
+        return programs[-1]
+
+    yield start
+    for program in programs:
+        program.kill()
+        program.communicate()
+
+
+def until(condition, what):
+    end = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < end, what
+        time.sleep(0.02)
+
+
+def is_gone(pid):
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+    return state == "Z"
+
+
+def all_wait(tmp_path):
+    until(lambda: len(notes(tmp_path)) == 4, "all four seeds have begun, two of them wait")
+    until(lambda: len(list((tmp_path / "out").glob("*/rows/[0-9]*.csv"))) == 2, "two are on disk")
+
+
+def end_of(program, tmp_path):
+    """Let the seeds go on that wait, and wait for the program's end."""
+
+    def ended():
+        with contextlib.suppress(OSError):  # nobody waits
+            os.close(os.open(tmp_path / "gate", os.O_WRONLY | os.O_NONBLOCK))
+        return program.poll() is not None
+
+    until(ended, "the program has ended")
+    return program.communicate()
+
+
+def test_a_killed_worker_costs_its_seed_a_second_try(started, tmp_path):
+    program = started()
+    all_wait(tmp_path)
+    lines = (tmp_path / "done").read_text().splitlines()
+    os.kill(next(int(line.split()[-1]) for line in lines if line.startswith("job 2")), signal.SIGKILL)
+    until(lambda: len(notes(tmp_path)) == 5, "the seed is tried again")
+    _, complaints = end_of(program, tmp_path)
+    assert (program.returncode, "python -m experiments:" in complaints) == (0, False)
+    assert sorted(notes(tmp_path)) == ["job 0", "job 1", "job 2", "job 2", "job 3"]
+    assert len(list((tmp_path / "out").glob("*/rows/[0-9]*.csv"))) == 4
+
+
+def test_a_killed_run_goes_on_where_it_was(started, tmp_path):
+    program = started()
+    all_wait(tmp_path)
+    workers = pids(tmp_path)
+    program.send_signal(signal.SIGKILL)
+    program.wait()
+    until(lambda: all(map(is_gone, workers)), "no process outlives the one that started it")
+    again = started()
+    _, complaints = end_of(again, tmp_path)
+    assert (again.returncode, "python -m experiments:" in complaints) == (0, False)
+    assert sorted(notes(tmp_path)) == ["job 0", "job 1", "job 2", "job 2", "job 3", "job 3"]
+
+
+def test_ctrl_c_ends_all_processes_in_one_line(started, tmp_path):
+    program = started()
+    all_wait(tmp_path)
+    os.killpg(program.pid, signal.SIGINT)  # as a terminal does: to all processes
+    _, complaints = program.communicate(timeout=DEADLINE_S)
+    assert program.returncode == 130
+    assert complaints.splitlines()[-1].startswith("python -m experiments: interrupted; 2 of 4 seeds are done and kept")
+    assert "Traceback" not in complaints
+    until(lambda: all(map(is_gone, pids(tmp_path))), "the workers have ended")
+
+
+def test_the_same_rows_from_dask_and_a_seed_that_kills_its_workers(tmp_path, capsys):
+    arguments = ["tiny", "alone", "--set", "tiny.fatal=[1]", "--set", "alone.fatal=[2]"]
+    assert main([*arguments, "--processes", "2", "--out", str(tmp_path / "dask")], KNOWN, tmp_path) == 1
+    complaints = capsys.readouterr().err
+    assert [line.partition("failed: ")[0] for line in complaints.splitlines() if "failed:" in line] == [
+        "python -m experiments: tiny, fatal=[1], seed 1 ",
+        "python -m experiments: alone, fatal=[2], seed 2 ",
+    ]
+    with pytest.MonkeyPatch.context() as patched:
+        for name, value in ONE_THREAD.items():
+            patched.setenv(name, value)
+        command = [sys.executable, "-c", ONLY_HERE, str(tmp_path / "here")]
+        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    (ours,) = (tmp_path / "here").glob("tiny*/rows")
+    (theirs,) = (tmp_path / "dask").glob("tiny*/rows")
+    for name in ("000000.csv", "000002.csv", "000003.csv"):
+        assert (ours / name).read_bytes() == (theirs / name).read_bytes()
+    assert not (theirs / "000001.csv").exists()
+
+
+ONLY_HERE = """
+import sys
+from experiments.command import main
+from tests.support.tiny_experiments import KNOWN, here, here_together
+assert main(["tiny", "--out", sys.argv[1]], KNOWN, together=here_together, apart=here) == 0
+"""
+
+
+def test_nobody_answers(tmp_path, capsys):
+    assert main(["tiny", "--out", str(tmp_path)], KNOWN) == 0
+    capsys.readouterr()
+    status = main(["tiny", "--fresh", "--scheduler", "nowhere", "--out", str(tmp_path)], KNOWN)
+    complaints = capsys.readouterr().err
+    assert (status, complaints.count("\n"), "nowhere" in complaints) == (1, 1, True)
+    assert len(list((tmp_path / "tiny" / "rows").iterdir())) == 4  # nothing is deleted where nothing can be done
+
+
+def test_without_dask_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigError, match=r"cotarget\[experiments\]"), on_dask(1, None):
+        pass
+
+
+# ---------------------------------------------------------------- the real ones
+def test_all_experiments_are_found_and_of_one_shape(capsys):
+    known = known_experiments()
+    assert {"hold", "chain", "fig4_book", "wire", "sim_speed"} <= set(known)
+    for name, load in known.items():
+        experiment = load()
+        assert (experiment.name, bool(experiment.purpose)) == (name, True)
+        assert len(experiment.jobs(experiment.quick)) <= len(experiment.jobs(experiment.settings))
+        assert experiment.plot is None or experiment.plot.__doc__  # the picture's caption
+    assert {name for name, load in known.items() if load().alone} == {
+        *("speed", "wire", "sim_speed", "env_speed", "pipeline_speed", "sweep_speed"),
+    }
+    assert main(["--list"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == len(known)
+
+
+@pytest.mark.parametrize("change", [
+    "chain.cases=['nope']", "chain.noise_px=-1", "chain.boards=2", "chain.looks=1", "hold.targets=['cat']",
+    "hold.seconds=2", "hold.seconds=20.1", "first_shot.seconds=3.1", "detectors.seconds=2.5", "wire.poll_s=0",
+    "depth_error.depths=[1.0]", "depth_error.wrong=-1", "hand_eye.noise_px=0", "hand_eye.poses=2",
+    "single_ptz.misses=[0.5, 1.5]", "photos.square=0", "calibration_budget.placements=[2, 6]", "fig4_book.seconds=7",
+    "fig4_book.places=3", "fig5_person.seconds=4", "fig6_outdoors.ways=['mine']", "sim_speed.seconds_rendered=0",
+    "env_speed.seconds=0.99", "wire.faults=['head.fire']",
+])  # fmt: skip
+def test_a_setting_that_cannot_be_is_refused_by_name(change):
+    key = change.partition("=")[0]
+    with pytest.raises(ConfigError, match=key.partition(".")[2]):
+        cases(key.partition(".")[0], changes=[change], known=known_experiments())
