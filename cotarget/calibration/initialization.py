@@ -187,6 +187,29 @@ class Steps:
         """True if the head ever left home."""
         return any(view.camera == "zoom" and not at_home(view) for view in self.views)
 
+    def residuals(
+        self,
+        views: Sequence[View],
+        rejected: Sequence[Rejected],
+        *,
+        stereo_px: float | None,
+        handeye_px: float | None,
+        outliers: int = 0,
+    ) -> Residuals:
+        """Make the residuals of a calibration that goes on from here, and used these views."""
+        zoom_views = sum(view.camera == "zoom" for view in views)
+        return Residuals(
+            fixed_rms_px=self.fixed_fit.rms_px,
+            zoom_rms_px=self.zoom_fit.rms_px,
+            stereo_rms_px=stereo_px,
+            handeye_rms_px=handeye_px if self.has_head else None,
+            fixed_views=len(views) - zoom_views,
+            zoom_views=zoom_views,
+            pairs=len({view.board for view in pairs_at_home(views)}),
+            outliers=outliers,
+            rejected=tuple(rejected),
+        )
+
 
 def both_cameras(
     views: Sequence[View], points: Array, sizes: Mapping[CameraName, tuple[int, int]], nominal_px: float | None
@@ -349,22 +372,13 @@ def sequential(
     check_pairs(steps, stereo_fit.rms_px)
     model = steps.model.with_zoom_head(T_zoom0_fixed=stereo_fit.model.head.T_zoom0_fixed)
     zoom_views = [view for view in steps.views if view.camera == "zoom"]
-    handeye_rms = None
+    handeye_px = None
     if steps.has_head:
         model = model.with_zoom_head(T_head_zoom=rough_hand(model, zoom_views, points))
         model = place_boards(model, steps.views, points)
         hand_fit = fit(model, zoom_views, points, {"hand", "head"})
-        model, handeye_rms = replace(model, zoom_head=hand_fit.model.zoom_head), hand_fit.rms_px
+        model, handeye_px = replace(model, zoom_head=hand_fit.model.zoom_head), hand_fit.rms_px
     else:
         model = place_boards(model, of_both(steps.views), points)
-    residuals = Residuals(
-        fixed_rms_px=steps.fixed_fit.rms_px,
-        zoom_rms_px=steps.zoom_fit.rms_px,
-        stereo_rms_px=stereo_fit.rms_px,
-        handeye_rms_px=handeye_rms,
-        fixed_views=len(steps.views) - len(zoom_views),
-        zoom_views=len(zoom_views),
-        pairs=len({view.board for view in pairs}),
-        rejected=steps.rejected,
-    )
+    residuals = steps.residuals(steps.views, steps.rejected, stereo_px=stereo_fit.rms_px, handeye_px=handeye_px)
     return Solution(model, residuals, steps.views, steps.has_head)

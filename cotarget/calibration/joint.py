@@ -62,6 +62,8 @@ from cotarget.calibration.model import (
     DEFAULT_OPTIONS,
     BundleModel,
     CameraName,
+    Covariance,
+    HeldOut,
     Options,
     Rejected,
     Residuals,
@@ -380,17 +382,7 @@ def joint(
     open_ = weak_directions(result.normal, names, result.variance or 0.0, focal)
     if not options.regularize and len(open_):
         raise CalibrationError(name_directions(names, open_, focal))
-    covariance = covariance_of(result)
-    held_out = None
-    widened = K3_WIDENED if "k3" in result.free else 1.0
-    if covariance is not None:
-        if options.folds:
-            held_out = cross_validate(result, points, prior, options.folds)
-            widened = max(widened, 1.0 if held_out is None else held_out.widened)
-        held = [block for block in CONSIDERED if block not in result.free and (block != "scale" or steps.has_head)]
-        usual = Prior(prior.reference, {**prior.sigmas, "fixed.k3": K3_WIDE, **ENCODER_SIGMAS})
-        covariance = with_consider_covariance(covariance, result, points, held, usual)
-        covariance = replace(covariance, matrix=covariance.matrix * widened**2)
+    covariance, held_out, widened = _uncertainty(result, points, prior, options)
     return Solution(
         model=result.model,
         residuals=_residuals(steps, result, points, rejected, wrong),
@@ -400,6 +392,27 @@ def joint(
         jitter=result.jitter * widened,
         held_out=held_out,
     )
+
+
+def _uncertainty(
+    found: Fit, points: Array, prior: Prior, options: Options
+) -> tuple[Covariance | None, HeldOut | None, float]:
+    """Compute the covariance of a fit, with the doubt about held parameters.
+
+    Returns:
+        Covariance, or None; result of the held-out check, or None; and the factor by which all standard deviations are
+        widened.
+    """
+    widened = K3_WIDENED if "k3" in found.free else 1.0
+    covariance = covariance_of(found)
+    if covariance is None:
+        return None, None, widened
+    held_out = cross_validate(found, points, prior, options.folds) if options.folds else None
+    widened = max(widened, 1.0 if held_out is None else held_out.widened)
+    held = [block for block in CONSIDERED if block not in found.free and (block != "scale" or "hand" in found.free)]
+    usual = Prior(prior.reference, {**prior.sigmas, "fixed.k3": K3_WIDE, **ENCODER_SIGMAS})
+    covariance = with_consider_covariance(covariance, found, points, held, usual)
+    return replace(covariance, matrix=covariance.matrix * widened**2), held_out, widened
 
 
 def _known(
@@ -552,15 +565,6 @@ def _with_k3_where_needed(found: Fit, points: Array, prior: Prior) -> tuple[Fit,
 def _residuals(steps: Steps, result: Fit, points: Array, rejected: Sequence[Rejected], wrong: int) -> Residuals:
     """Compute the rms of each part fitted by itself, as is customary, and that of the joint fit."""
     pairs = pairs_at_home(result.views)
-    zoom = np.array([view.camera == "zoom" for view in result.views])
-    return Residuals(
-        fixed_rms_px=steps.fixed_fit.rms_px,
-        zoom_rms_px=steps.zoom_fit.rms_px,
-        stereo_rms_px=stereo(steps.model, pairs, points).rms_px if pairs else None,
-        handeye_rms_px=rms(result.residuals[zoom]) if steps.has_head else None,
-        fixed_views=int(np.count_nonzero(~zoom)),
-        zoom_views=int(np.count_nonzero(zoom)),
-        pairs=len({view.board for view in pairs}),
-        outliers=wrong,
-        rejected=tuple(rejected),
-    )
+    stereo_px = stereo(steps.model, pairs, points).rms_px if pairs else None
+    handeye_px = rms(result.residuals[[view.camera == "zoom" for view in result.views]])
+    return steps.residuals(result.views, rejected, stereo_px=stereo_px, handeye_px=handeye_px, outliers=wrong)

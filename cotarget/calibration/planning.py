@@ -21,6 +21,7 @@ from cotarget.errors import UnreachableError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import nearest, solve
 from cotarget.rig import PanTiltLimits
+from cotarget.rig_geometry import ZoomHead
 
 # Predicted accuracy
 
@@ -123,8 +124,8 @@ class Coverage:
     misses: list[tuple[Array, float]] = field(default_factory=list)
 
     def add(self, corners_px: Array) -> None:
-        """Count corners (N, 2) [px]."""
-        np.add.at(self.counts, self._cells(corners_px), 1)
+        """Count corners (N, 2) [px]; nan does not count."""
+        np.add.at(self.counts, self._cells(corners_px[np.isfinite(corners_px[:, 0])]), 1)
 
     def gain(self, corners_px: Array) -> float:
         """Compute the gain of further corners (N, 2) [px]; one in a cell with n others counts about 1 / (1 + n)."""
@@ -291,10 +292,7 @@ def plan_poses(
     allowed = limits.allow(pan, tilt)
     pan, tilt = pan[allowed], tilt[allowed]
     x_base = (head.T_base_fixed * T_fixed_board).apply(board_body(board))
-    R, t, _ = base_heads(head.axes, pan, tilt)
-    x_head = (x_base - t[:, None]) @ R
-    x_zoom = head.hand_eye().inv().apply(x_head.reshape(-1, 3)).reshape(x_head.shape)
-    good, seen = visible(lens, x_zoom, board, margin_px)
+    good, seen = visible(lens, in_zoom(head, head.hand_eye(), x_base, pan, tilt), board, margin_px)
     candidates = [int(k) for k in np.flatnonzero(good)]
     chosen: list[tuple[float, float]] = []
     planned = Coverage(coverage.size, coverage.counts.copy())
@@ -304,6 +302,13 @@ def plan_poses(
         planned.add(seen[k])
         chosen.append((float(pan[k]), float(tilt[k])))
     return chosen
+
+
+def in_zoom(head: ZoomHead, T_head_zoom: RigidTransform, x_base: Array, pan: Array, tilt: Array) -> Array:
+    """Map points of the base's frame (N, 3) into the zoom camera's at many head poses (K,), (K, N, 3)."""
+    R, t, _ = base_heads(head.axes, pan, tilt)
+    x_head = (x_base - t[:, None]) @ R
+    return T_head_zoom.inv().apply(x_head.reshape(-1, 3)).reshape(x_head.shape)
 
 
 def seen_at_home(model: BundleModel, T_fixed_board: RigidTransform, board: BoardConfig) -> bool:

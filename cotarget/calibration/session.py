@@ -25,7 +25,7 @@ from typing import TypeVar
 import numpy as np
 
 from cotarget.board import board_points, check_board
-from cotarget.calibration.bundle import Block, Fit, base_heads, fit
+from cotarget.calibration.bundle import Block, Fit, fit
 from cotarget.calibration.captures import (
     INDEX,
     NO_IMAGE,
@@ -55,6 +55,7 @@ from cotarget.calibration.planning import (
     PredictedAccuracy,
     distance,
     facing_board,
+    in_zoom,
     plan_placements,
     plan_poses,
     planned_views,
@@ -146,8 +147,8 @@ class CaptureRecorder:
         self._stands_since(state.t)
         return state.focal_px
 
-    def present(self, T_fixed_board: RigidTransform) -> int:
-        """Request the board at a pose as a new placement, and return the placement's number."""
+    def present(self, T_fixed_board: RigidTransform) -> None:
+        """Request the board at a pose as a new placement."""
         wish = RigidTransform.from_components(
             np.round(T_fixed_board.translation, WISH_DECIMALS),
             Rotation.from_rotvec(np.round(T_fixed_board.rotation.as_rotvec(), WISH_DECIMALS)),
@@ -159,7 +160,6 @@ class CaptureRecorder:
             self._wait_until_held(before)
         self._stands_since(self.rig.clock.now())
         self.number += 1
-        return self.number
 
     def _fixed_corners(self) -> Array | None:
         """Find the board's corners in a frame of the fixed camera exposed after now, (N, 2) [px], or None."""
@@ -349,7 +349,7 @@ def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> BundleMo
             continue
         recorder.present(wishes[0])
         if (view := recorder.see_fixed()) is not None:
-            coverage["fixed"].add(view.corners_px[view.seen])
+            coverage["fixed"].add(view.corners_px)
         recorder.see_zoom(expected=False)
     return BundleModel({}, FixedCamera(_rough_lens(recorder, "fixed")))
 
@@ -591,7 +591,7 @@ def see_stops(
     coverage = {"fixed": Coverage(recorder.rig.fixed.size)}
     for view in recorder.views:
         if view.camera == "fixed":
-            coverage["fixed"].add(view.corners_px[view.seen])
+            coverage["fixed"].add(view.corners_px)
     reachable = functools.partial(_reachable, recorder, model)
     at_stop: dict[int, Coverage] = {}
     only_fixed = replace(model, zoom_head=None)
@@ -611,7 +611,7 @@ def see_stops(
             coverage["fixed"].misses.append(where_in(model.fixed.lens, recorder.board, wishes[0]))
             continue
         done += 1
-        coverage["fixed"].add(fixed_view.corners_px[fixed_view.seen])
+        coverage["fixed"].add(fixed_view.corners_px)
         for i, stop in enumerate(stops[1:], start=2):
             tell(f"zoom stop {i} of {len(stops)}, board {done} of {placements}")
             nominal = recorder.zoom(stop)
@@ -683,7 +683,7 @@ def _see_part(
     recorder.turn(*turn)
     view = recorder.see_zoom(find=lambda image, view: find_expected(image, view, model, recorder.board))
     if view is not None:
-        coverage.add(view.corners_px[view.seen])
+        coverage.add(view.corners_px)
     return view
 
 
@@ -703,8 +703,7 @@ def plan_part(
     found = solve(T_base_board.apply(chosen), hand, head.axes, lens.ray(pixels))
     pan, tilt = found.pan[:, 0], found.tilt[:, 0]
     best, most = None, 0.0
-    R, t, _ = base_heads(head.axes, np.nan_to_num(pan), np.nan_to_num(tilt))
-    x_zoom = hand.inv().apply(((T_base_board.apply(points) - t[:, None]) @ R).reshape(-1, 3)).reshape(CANDIDATES, -1, 3)
+    x_zoom = in_zoom(head, hand, T_base_board.apply(points), np.nan_to_num(pan), np.nan_to_num(tilt))
     for k in np.flatnonzero(recorder.rig.head.limits.allow(pan, tilt)):
         seen = lens.project(x_zoom[k])
         seen = seen[expected_inside(seen, lens.size)]
@@ -875,7 +874,7 @@ def _cover(
     """Take views of placements that cover both images, from several head poses each, and refine the rough model."""
     coverage = {"fixed": Coverage(recorder.rig.fixed.size), "zoom": Coverage(recorder.rig.zoom.size)}
     for view in recorder.views:
-        coverage[view.camera].add(view.corners_px[view.seen])
+        coverage[view.camera].add(view.corners_px)
     predicted: PredictedAccuracy | None = None
     misses = done = 0
     while recorder.number + 1 < placements:
@@ -967,5 +966,5 @@ def _see_from_everywhere(
         recorder.turn(pan, tilt)
         recorder.see_zoom()
     for view in recorder.of_placement(recorder.number):
-        coverage[view.camera].add(view.corners_px[view.seen])
+        coverage[view.camera].add(view.corners_px)
     return T

@@ -1,5 +1,1 @@
 """Calibration report: an HTML page on how well a calibration points; `cotarget.report.page` writes it."""
-
-from cotarget.report.text import verdict
-
-__all__ = ["verdict"]

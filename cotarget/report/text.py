@@ -545,11 +545,6 @@ class Verdict:
     level: Level
 
 
-def verdict(calibration: Calibration) -> str:
-    """Describe in one sentence how well a calibration points, and whether captures kept out of its fit agree."""
-    return judge(calibration).text
-
-
 def judge(
     calibration: Calibration,
     at: tuple[AtFocal, ...] | None = None,

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration import Calibration, View
+from cotarget.calibration import Calibration
 from cotarget.calibration.bundle import ALL_BLOCKS, Prior, parameter_names
 from cotarget.calibration.uncertainty import cross_validate, model_of
 from experiments.calibration.synthetic.rig import NOMINAL_PX, Lens, Truth, other_rig, truth_of
-from experiments.calibration.synthetic.views import Placing, noisy, placed, views_at_stops, zoom_view
-from tests.support.synthetic_calibration import NOISE_PX, POINTS, calibrated, drawn, fitted
+from experiments.calibration.synthetic.views import Placing
+from tests.support.synthetic_calibration import NOISE_PX, POINTS, calibrated, drawn, drawn_at_stops, fitted
 from tests.support.synthetic_rig import fourfold
 
 RIGS = (Truth(), other_rig())
@@ -60,18 +60,6 @@ SAME_MISS = 0.03
 SAME_FIT = 1e-3  # a fit stops within a thousandth of a standard deviation of its optimum
 
 
-def drawn_at_stops(truth, seed):
-    """Views at the shortest focal length and at the further stops of a zoom lens."""
-    rng, placing = np.random.default_rng((seed, 3)), Placing(boards=BOARDS, looks=3)
-    views, corners, home = [], [], np.zeros(2)
-    for number in range(BOARDS):
-        x_fixed, poses = placed(truth, POINTS, rng, placing, number)
-        corners.append(x_fixed)
-        views.append(View("fixed", noisy(truth.fixed.project(x_fixed), NOISE_PX, rng), number))
-        views += [zoom_view(truth, x_fixed, number, pose, home, NOISE_PX, rng) for pose in poses]
-    return views + views_at_stops(truth, corners, rng, NOISE_PX)
-
-
 @pytest.mark.parametrize("stops", [(), (fourfold(2 * NOMINAL_PX),)], ids=["one focal length", "two"])
 def test_what_is_measured_is_the_miss_of_the_prediction(stops):
     """Every fold predicted by hand: OpenCV's pose of the board, and the head's matrices written out.
@@ -79,7 +67,7 @@ def test_what_is_measured_is_the_miss_of_the_prediction(stops):
     A miss counts in pixels of the shortest focal length.
     """
     truth, folds = replace(Truth(), stops=stops), 2
-    views = drawn_at_stops(truth, 0)
+    views = drawn_at_stops(truth, np.random.default_rng((0, 3)), Placing(boards=BOARDS, looks=3))
     start = model_of(calibrated(views))
     everything = fitted(start, views)
     squares = []

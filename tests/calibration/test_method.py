@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cotarget.calibration import calibrate_photos, calibrate_views
-from cotarget.calibration.bundle import EVERY_BLOCK, batches_of, difference, parameter_names, predict, stepped
+from cotarget.calibration.bundle import EVERY_BLOCK, batches_of, difference, fit, parameter_names, predict, stepped
 from cotarget.calibration.initialization import rough_gamma
 from cotarget.calibration.model import BundleModel, View
 from cotarget.camera import Intrinsics, ZoomLens
@@ -180,7 +180,11 @@ def test_two_cameras_that_did_not_stand_still_are_refused(turned, method):
 def test_two_cameras_that_stood_still_are_not():
     found = calibrated(without_a_head(0))
     off = found.zoom_head.T_zoom0_fixed.translation - Truth().gamma.translation
-    assert (np.abs(off) < 3 * np.array([found.covariance.sigma(f"T_zoom0_fixed.t{axis}") for axis in "xyz"])).all()
+    sigmas = np.array([found.covariance.sigma(f"T_zoom0_fixed.t{axis}") for axis in "xyz"])
+    assert (np.abs(off) < 3 * sigmas).all()
+    step_by_step = calibrated(without_a_head(0), "sequential")
+    assert step_by_step.zoom_head.T_head_zoom is None
+    assert step_by_step.residuals.stereo_rms_px < 0.2  # two coordinates of 0.1 px noise each are 0.14
 
 
 def test_what_cannot_be_calibrated_is_refused_in_words():
@@ -193,6 +197,8 @@ def test_what_cannot_be_calibrated_is_refused_in_words():
         calibrate_views(views, BoardConfig(corners=(8, 6)), SIZES)
     with pytest.raises(CalibrationError, match="8x5"):
         calibrate_views(views, BoardConfig(corners=(8, 5)), SIZES)
+    with pytest.raises(CalibrationError, match="no views"):
+        fit(BundleModel({}, FixedCamera(Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0)))), [], POINTS, ())
 
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")

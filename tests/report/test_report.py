@@ -12,12 +12,9 @@ import numpy as np
 import pytest
 
 from cotarget import cli
-from cotarget.board import board_points
-from cotarget.calibration import Covariance, HeldOut, Options, Rejected, View, calibrate_views, save_calibration
+from cotarget.calibration import Covariance, HeldOut, Options, Rejected, calibrate_views, save_calibration
 from cotarget.cli.calibrating import calibration_summary
-from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, ConfigError
-from cotarget.report import verdict
 from cotarget.report.analysis import (
     JITTER_GROUP,
     Corners,
@@ -35,32 +32,18 @@ from cotarget.report.page import write_report
 from cotarget.report.text import advice, correlations, digits, judge, percent, value_and_sigma
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, SIZES, Lens, Stop, Truth
-from experiments.calibration.synthetic.views import Placing, noisy, placed, synthetic_views, views_at_stops, zoom_view
+from experiments.calibration.synthetic.views import Placing, synthetic_views
 from tests.support.full_disk import SAID, full_disk
 from tests.support.rigs import with_zoom_head
+from tests.support.synthetic_calibration import BOARD, NOISE_PX, POINTS, drawn_at_stops
 
-BOARD = BoardConfig()
-POINTS = board_points(BOARD)
 SECTIONS = ["figures", "pointing", "parameters", "residuals", "coverage", "lens", "heldout", "rejected", "advice"]
-NOISE_PX = 0.1
 ZOOMED = 3.0  # the second stop's focal length over the first's
 LARGEST_PAGE = 3_000_000
 UNCHECKED = Options(folds=0)  # nothing is kept out, to be quick
 ROUNDED = 0.06  # two digits are printed
 FAR_LENS = Lens(ZOOMED * 692.0, ZOOMED * 693.0, 328.0, 234.0)
 ZOOMING = Truth(stops=(Stop(ZOOMED * NOMINAL_PX, FAR_LENS, 0.01),))
-
-
-def stop_views(truth, rng, boards=8):
-    """Views at the shortest focal length and at `ZOOMED` times that, of the same boards."""
-    placing = Placing(boards=boards)
-    placements, views = [], []
-    for number in range(boards):
-        x_fixed, poses = placed(truth, POINTS, rng, placing, number)
-        placements.append(x_fixed)
-        views.append(View("fixed", noisy(truth.fixed.project(x_fixed), NOISE_PX, rng), number))
-        views += [zoom_view(truth, x_fixed, number, pose, np.zeros(2), NOISE_PX, rng) for pose in poses]
-    return views + views_at_stops(truth, placements, rng, NOISE_PX, looks=1)
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +54,8 @@ def plain():
 
 @pytest.fixture(scope="module")
 def stops():
-    return calibrate_views(
-        stop_views(ZOOMING, np.random.default_rng(4)), BOARD, SIZES, pitch_mm=0.005, options=UNCHECKED
-    )
+    views = drawn_at_stops(ZOOMING, np.random.default_rng(4), Placing(boards=8), looks=1)
+    return calibrate_views(views, BOARD, SIZES, pitch_mm=0.005, options=UNCHECKED)
 
 
 def bare(calibration, **changes):
@@ -181,8 +163,9 @@ def test_the_verdict_is_as_true_as_it_says(plain, stops):
         assert said / 3 < np.sqrt(np.mean(errors**2)) < said * 3
     last = pointing(stops)[-1]
     assert last.focal_px == pytest.approx(ZOOMED * Truth().zoom.fx, rel=0.01)
-    assert f"({digits(last.rms * last.focal_px)} px at {last.focal_px:.0f} px, the longest focal length" in verdict(
-        stops
+    assert (
+        f"({digits(last.rms * last.focal_px)} px at {last.focal_px:.0f} px, the longest focal length"
+        in judge(stops).text
     )
 
 
@@ -235,7 +218,7 @@ def test_a_wrong_model_leaves_nothing_undetermined(plain):
 
 def test_corners_of_another_rig_are_noticed(plain):
     others = tuple(replace(view, corners_px=view.corners_px[::-1] / 2) for view in plain.views)
-    assert "not what it was made from" in verdict(replace(plain, views=others))
+    assert "not what it was made from" in judge(replace(plain, views=others)).text
 
 
 def partial_calibrations():
@@ -420,7 +403,7 @@ def test_mistakes_end_in_one_line_and_leave_the_page(plain, tmp_path, capsys):
     assert "page_pictures" in fails(source, "--out", page)
     (tmp_path / "page_pictures").unlink()
     assert cli.main(["report", str(source), "--out", str(page)]) == 0
-    assert verdict(bare(plain, covariance=None)) in capsys.readouterr().out
+    assert judge(bare(plain, covariance=None)).text in capsys.readouterr().out
     assert page.read_text().startswith("<!DOCTYPE html>")
 
 

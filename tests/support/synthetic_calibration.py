@@ -3,13 +3,13 @@
 import numpy as np
 
 from cotarget.board import board_points
-from cotarget.calibration import Options, calibrate_views, predicted_pointing
+from cotarget.calibration import Options, View, calibrate_views, predicted_pointing
 from cotarget.calibration.bundle import ALL_BLOCKS, fit
 from cotarget.calibration.initialization import place_boards
 from cotarget.config import BoardConfig
 from experiments.calibration.synthetic.aims import draw_targets, misses
 from experiments.calibration.synthetic.rig import SIZES
-from experiments.calibration.synthetic.views import Placing, spread_views
+from experiments.calibration.synthetic.views import Placing, noisy, placed, spread_views, views_at_stops, zoom_view
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -23,6 +23,17 @@ def drawn(truth, seed=0, boards=10, looks=3, noise_px=NOISE_PX):
     """Views of placements all over both images."""
     placing = Placing(boards=boards, looks=looks)
     return spread_views(truth, POINTS, np.random.default_rng((seed, 3)), noise_px, placing)
+
+
+def drawn_at_stops(truth, rng, placing, **looks):
+    """Views of placements at the shortest focal length and at the further zoom samples, of the same boards."""
+    views, corners, home = [], [], np.zeros(2)
+    for number in range(placing.boards):
+        x_fixed, poses = placed(truth, POINTS, rng, placing, number)
+        corners.append(x_fixed)
+        views.append(View("fixed", noisy(truth.fixed.project(x_fixed), NOISE_PX, rng), number))
+        views += [zoom_view(truth, x_fixed, number, pose, home, NOISE_PX, rng) for pose in poses]
+    return views + views_at_stops(truth, corners, rng, NOISE_PX, **looks)
 
 
 def calibrated(views, method="joint", folds=0, **options):
