@@ -184,7 +184,8 @@ def test_two_cameras_that_stood_still_are_not():
     assert (np.abs(off) < 3 * sigmas).all()
     step_by_step = calibrated(without_a_head(0), "sequential")
     assert step_by_step.zoom_head.T_head_zoom is None
-    assert step_by_step.residuals.stereo_rms_px < 0.2  # two coordinates of 0.1 px noise each are 0.14
+    # Two coordinates of 0.1 px noise each are 0.14 px; the intrinsics, which are held, add as much.
+    assert step_by_step.residuals.stereo_rms_px < 0.28
 
 
 def test_what_cannot_be_calibrated_is_refused_in_words():
