@@ -44,6 +44,14 @@ def test_an_unknown_key_is_told_with_the_valid_ones_and_an_unknown_driver_with_t
     assert refusal("hardware.fixed.driver = 'axes'").endswith(": axis")
 
 
+@pytest.mark.parametrize("backend", ["hardware", "sim"])
+@pytest.mark.parametrize("camera", ["fixed", "zoom"])
+def test_a_latency_that_makes_every_frame_too_old_is_told_by_its_key(backend, camera):
+    text = f"backend = '{backend}'\nsafety.max_frame_age_s = 2.0\n{backend}.{camera}.latency_s = "
+    check(parse_config(tomllib.loads(f"{text}1.9")))
+    assert refusal(f"{text}20").startswith(f"{backend}.{camera}.latency_s: ")
+
+
 @pytest.mark.parametrize(("url", "address"), [
     ("socket://10.0.0.2:4000", ("10.0.0.2", 4000)),
     ("socket://ptu.local:4000/", ("ptu.local", 4000)),

@@ -97,6 +97,8 @@ class Stream:
 class VideoServer:
     """An Axis video server; a network camera counts as one with a single input.
 
+    Every request raises DeviceError where the server cannot be reached.
+
     Args:
         config: address, input and image settings of the fixed camera.
 
@@ -119,11 +121,7 @@ class VideoServer:
         self.web = WebDevice(self.name, self._user, self._password, self.silence_s)
 
     def identify(self) -> dict[str, str]:
-        """List the server's parameters of brand, properties and inputs; {} where it lists none, or not for this user.
-
-        Raises:
-            DeviceError: the server cannot be reached.
-        """
+        """List the parameters of brand, properties and inputs; {} where the server lists none, or not for this user."""
         for path in PARAMETER_PATHS:
             listed = self._parameters(path, "root.Brand")
             if listed is None:
@@ -135,11 +133,7 @@ class VideoServer:
         return {}
 
     def has_video(self) -> bool | None:
-        """Ask whether a camera is connected to the input; None where the server does not say.
-
-        Raises:
-            DeviceError: the server cannot be reached.
-        """
+        """Ask whether a camera is connected to the input; None where the server does not say."""
         camera = self._config.camera
         text = self.web.text(STATUS_PATH, {"status": str(camera)}) or ""
         match = re.search(rf"^\s*Video\s+{camera}\s*=\s*(no\s+)?video\b", text, re.IGNORECASE | re.MULTILINE)
@@ -149,7 +143,7 @@ class VideoServer:
         """Refuse a server that reports itself as the wrong one; return its parameters as `identify` does.
 
         Raises:
-            DeviceError: the server cannot be reached, is no Axis, has no such input, or has no video there.
+            DeviceError: the server is no Axis, has no such input, or has no video there.
         """
         listed, camera = self.identify(), self._config.camera
         brand, inputs = listed.get("Brand.Brand") or AXIS, listed.get("ImageSource.NbrOfSources", "")
@@ -191,7 +185,7 @@ class VideoServer:
         Raises:
             BusyError: the server has no place for another viewer now.
             StreamRefusedError: the server has no such stream for this user.
-            DeviceError: the server cannot be reached, or the stream breaks off; also while it is read.
+            DeviceError: the stream breaks off; also while it is read.
         """
         config = self._config
         rate = f"{max(round(config.rate_hz), 1)}"

@@ -66,6 +66,8 @@ class Port(Protocol):
 class SerialLine:
     """Bytes to and from a unit; used by one thread at a time.
 
+    Every method but `close` raises LostError where the port failed.
+
     Args:
         port: an open port whose reads return empty after a short while.
         name: name of the port, for error messages.
@@ -84,22 +86,14 @@ class SerialLine:
         self.heard = b""
 
     def write(self, data: bytes) -> None:
-        """Send bytes without waiting for an answer.
-
-        Raises:
-            LostError: the port failed.
-        """
+        """Send bytes without waiting for an answer."""
         try:
             self._port.write(data)
         except OSError as error:  # pyserial's exceptions are of this kind too
             raise LostError(self.name, error) from error
 
     def read(self, wait: bool = True) -> bytes:
-        """Read the bytes that have arrived; if there are none, wait for the first one until the port's timeout.
-
-        Raises:
-            LostError: the port failed.
-        """
+        """Read the bytes that have arrived; if there are none, wait for the first one until the port's timeout."""
         try:
             there = self._port.in_waiting
             data = self._port.read(max(there, 1)) if there or wait else b""
@@ -109,11 +103,7 @@ class SerialLine:
         return data
 
     def read_until_quiet(self, quiet_s: float, most_s: float) -> bytes:
-        """Read until ``quiet_s`` of silence or for ``most_s`` [s].
-
-        Raises:
-            LostError: the port failed.
-        """
+        """Read until ``quiet_s`` of silence or for ``most_s`` [s]."""
         start = last = self._clock.now()
         data = b""
         while (now := self._clock.now()) - last < quiet_s and now - start < most_s:

@@ -119,13 +119,6 @@ def test_a_speed_cap_that_the_unit_cannot_keep_is_refused(opened, bench):
     opened(CONFIG, speed_deg_s=1.6)
 
 
-def test_it_moves_from_the_moment_of_the_command(opened):
-    head = opened()
-    for n in range(1, 20):
-        head.move(n * 50 * STEP, 0.0)
-        assert head.state().moving
-
-
 def test_the_error_of_a_move_comes_to_who_waits_or_with_the_next_call(opened, bench):
     head = opened()
     bench.unit.scripted = {f"PP{n}": [b"! Maximum allowable Pan position is 90\r\n"] for n in (100, 101)}
