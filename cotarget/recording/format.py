@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from cotarget.config import RigConfig, parse_config
 from cotarget.control.selection import check_selector_table
@@ -33,6 +33,7 @@ META, LOG, CALIBRATION, TEMPLATE = "recording.json", "log.jsonl", "calibration.j
 FIXED, ZOOM = "fixed", "zoom"  # the frames' folders
 COMPLETE = "complete"  # value of `end` for a run that nothing interrupted
 Number = float | bool | None
+Parsed = TypeVar("Parsed")
 # Calls on a rig: valid numbers of arguments, and number of values in the result. A frame's result is its time.
 CALLS: Mapping[str, tuple[tuple[int, ...], int]] = {
     "fixed.read": ((2,), 1),  # newer_than, timeout -> t
@@ -76,6 +77,11 @@ class Event:
     error: tuple[str, str] | None = None
     error_class: str = ""
     aside: bool = False
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The result as floats; a frame's one is its exposure time [s]."""
+        return tuple(float(value or 0.0) for value in self.result)
 
 
 def argument_numbers(call: str, arguments: Sequence[Any]) -> tuple[Number, ...]:
@@ -306,7 +312,7 @@ class Recording:
     def pictures(self) -> dict[float, int]:
         """Numbers of the fixed camera's images, from 0, by their exposure time [s]."""
         frames = [event for event in self.events if event.call == "fixed.read"]
-        return {float(e.result[0] or 0.0): int(Path(e.image).stem) for e in frames if e.image is not None}
+        return {event.numbers[0]: int(Path(event.image).stem) for event in frames if event.image is not None}
 
     @property
     def seconds(self) -> float:
@@ -335,11 +341,11 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
     try:
         for number, row in _rows(directory / LOG):
             if "rig" in row:
-                spec = _spec(row["rig"], number, partial(describe, config))
+                spec = _parsed(number, parse_spec, row["rig"], partial(describe, config))
             elif "end" in row:
                 ending = str(row["end"])
             else:
-                rows.append(_whole(directory, _event(row, number)))
+                rows.append(_whole(directory, _parsed(number, parse_event, row)))
     except _DamageError as damage:
         stop = str(damage)
     if spec is None:
@@ -352,7 +358,8 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
         notes.append(f"is cut short, and replays up to {rows[-1].at - rows[0].at:.2f} s: {stop}")
     elif ending != COMPLETE:
         notes.append(f"the run was ended by {ending}")
-    if missing := sum(event.call in ("zoom.read", "zoom.capture") and _imageless(event) for event in rows):
+    missing = sum(e.call in ("zoom.read", "zoom.capture") and e.image is None and e.error is None for e in rows)
+    if missing:
         notes.append(f"{missing} frames of the zoom camera lack their image; the one before stands in")
     if meta["cotarget"] != version("cotarget"):
         notes.append(f"was recorded by cotarget {meta['cotarget']}; this is {version('cotarget')}")
@@ -380,7 +387,7 @@ def read_spec(directory: Path, describe: Callable[[RigConfig], RigSpec]) -> RigS
     with suppress(_DamageError):
         for number, row in _rows(directory / LOG):
             if "rig" in row:
-                return _spec(row["rig"], number, partial(describe, config))
+                return _parsed(number, parse_spec, row["rig"], partial(describe, config))
     raise ConfigError(f"{directory}: does not say what the recorded rig was")
 
 
@@ -434,22 +441,13 @@ def _rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:
             yield number, row
 
 
-def _event(row: Mapping[str, Any], number: int) -> Event:
+def _parsed(number: int, parse: Callable[..., Parsed], *row: Any) -> Parsed:
+    """Parse a line of the log by its number."""
     try:
-        return parse_event(row)
+        return parse(*row)
     except (ValueError, TypeError, KeyError, OverflowError) as error:
-        raise _DamageError(f"line {number} of {LOG} is damaged: {_words(error)}") from None
-
-
-def _spec(table: Any, number: int, described: Callable[[], RigSpec]) -> RigSpec:
-    try:
-        return parse_spec(table, described)
-    except (ValueError, TypeError, KeyError, OverflowError) as error:
-        raise _DamageError(f"line {number} of {LOG} is damaged: {_words(error)}") from None
-
-
-def _words(error: Exception) -> str:
-    return f"missing key {error}" if isinstance(error, KeyError) else str(error)
+        reason = f"missing key {error}" if isinstance(error, KeyError) else str(error)
+        raise _DamageError(f"line {number} of {LOG} is damaged: {reason}") from None
 
 
 def _whole(directory: Path, event: Event) -> Event:
@@ -467,10 +465,6 @@ def _whole(directory: Path, event: Event) -> Event:
     if event.call == "fixed.read":
         raise _DamageError(f"{event.image} is {'missing' if size < 0 else 'damaged'}")
     return replace(event, image=None)
-
-
-def _imageless(event: Event) -> bool:
-    return event.image is None and event.error is None
 
 
 def _without_last_step(events: list[Event]) -> list[Event]:

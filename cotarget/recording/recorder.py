@@ -114,7 +114,7 @@ class RecordWriter:
             picture = None
             if image is not None and not self.failure:
                 assert isinstance(event, Event)
-                picture = self._picture(camera, image, float(event.result[0] or 0.0))
+                picture = self._picture(camera, image, event.numbers[0])
             if not self.failure:  # checked again: it may have failed during the wait for room
                 self._queue.append((event, picture))
                 self._changed.notify_all()

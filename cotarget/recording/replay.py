@@ -216,7 +216,7 @@ class Replay:
         for index in range(self._index + 1, len(self._spans)):
             frame, following = self._frames[index - 1], self._frames[index : index + 1]
             overtaken = bool(following) and following[0].at < self.now
-            too_old = newer_than is not None and frame.error is None and time_of(frame) <= newer_than
+            too_old = newer_than is not None and frame.error is None and frame.numbers[0] <= newer_than
             if frame.error is not None or not (overtaken or too_old):
                 break
         else:
@@ -295,11 +295,6 @@ class Replay:
         return RecordingEndedError(f"{self._recording.directory}: the recording ends here, at {self.now:.2f} s")
 
 
-def time_of(frame: Event) -> float:
-    """Return the exposure time of a frame [s]."""
-    return float(frame.result[0] or 0.0)
-
-
 def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
     """Cut events into spans between frames; return spans and frames.
 
@@ -365,7 +360,7 @@ class _Camera:
             image = np.asarray(read, dtype=np.uint8)
             image.flags.writeable = False
             self._newest = (name, image)
-        return Frame(image, time_of(event))
+        return Frame(image, event.numbers[0])
 
 
 class _FixedCamera(_Camera):
@@ -393,7 +388,7 @@ class _ZoomCamera(_Camera):
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
         event = self._replay.answer("zoom.read")
-        if event is None or (newer_than is not None and time_of(event) <= newer_than):
+        if event is None or (newer_than is not None and event.numbers[0] <= newer_than):
             event = self._by_time(newer_than, timeout)
         return self._frame(event, event.image or self._stand_in(event))
 
@@ -407,7 +402,7 @@ class _ZoomCamera(_Camera):
         if recorded is not None:
             self._replay.play(recorded)
             if recorded.args == (focal_px,):
-                return float(recorded.result[0] or 0.0)
+                return recorded.numbers[0]
         if not 0 < focal_px < math.inf:
             raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
         return min(max(focal_px, self.focal_range[0]), self.focal_range[1])
@@ -417,12 +412,12 @@ class _ZoomCamera(_Camera):
         if event is None:
             (focal,), moving = self._states.at(self._replay.now, "lens")
             return ZoomState(focal, moving, self._replay.now)
-        then = event.result
-        return ZoomState(float(then[0] or 0.0), bool(then[1]), float(then[2] or 0.0))
+        focal, moving, t = event.numbers
+        return ZoomState(focal, bool(moving), t)
 
     def _by_time(self, newer_than: float | None, timeout: float) -> Event:
         """Return the newest frame read by now, or the first one within ``timeout``."""
-        fresh = [e for e in self._frames if newer_than is None or time_of(e) > newer_than]
+        fresh = [e for e in self._frames if newer_than is None or e.numbers[0] > newer_than]
         if before := [e for e in fresh if e.at <= self._replay.now]:
             return before[-1]
         if fresh and fresh[0].at <= self._replay.now + timeout:
@@ -451,8 +446,8 @@ class _Head:
         if event is None:
             (pan, tilt), moving = self._states.at(self._replay.now, "head")
             return PanTiltState(pan, tilt, moving, self._replay.now)
-        then = event.result
-        return PanTiltState(float(then[0] or 0.0), float(then[1] or 0.0), bool(then[2]), float(then[3] or 0.0))
+        pan, tilt, moving, t = event.numbers
+        return PanTiltState(pan, tilt, bool(moving), t)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         recorded = self._replay.take("head.move")
@@ -461,7 +456,7 @@ class _Head:
         if recorded is not None:
             self._replay.play(recorded)
             if recorded.args == args:
-                return float(recorded.result[0] or 0.0), float(recorded.result[1] or 0.0)
+                return recorded.numbers[0], recorded.numbers[1]
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
         return self._possible(pan, self._limits.pan), self._possible(tilt, self._limits.tilt)
@@ -487,7 +482,7 @@ class _Clock:
 
     def now(self) -> float:
         event = self._replay.answer("clock.now")
-        return self._replay.now if event is None else float(event.result[0] or 0.0)
+        return self._replay.now if event is None else event.numbers[0]
 
     def sleep_until(self, t: float) -> None:
         if self._replay.answer("clock.sleep_until") is None and not self._replay.is_aside:
@@ -508,7 +503,7 @@ class _Track:
     """Recorded states of a device: numbers, whether it moved, and the time."""
 
     def __init__(self, events: Sequence[Event]) -> None:
-        rows = np.array([[float(value or 0.0) for value in e.result] for e in events], dtype=float)
+        rows = np.array([event.numbers for event in events], dtype=float)
         self._rows = rows[np.argsort(rows[:, -1], kind="stable")] if len(rows) else rows
 
     def at(self, t: float, device: str) -> tuple[list[float], bool]:
