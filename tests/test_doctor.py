@@ -130,6 +130,11 @@ def test_rendering_is_really_tried():
     assert doctor.rendering().ok
 
 
+def test_a_pyav_without_an_encoder_is_told(tried, monkeypatch):
+    monkeypatch.setattr("av.codecs_available", set())
+    assert (finding("H.264").ok, "av" in finding("H.264").fix) == (False, True)
+
+
 def real(**tables):
     return parse_config({"backend": "hardware", "hardware": tables})
 
