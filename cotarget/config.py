@@ -295,12 +295,8 @@ QUALITY = ("multisampling", "shadows")
 ALL = "all"
 
 
-def expand_all(effects: Mapping[str, Any]) -> dict[str, Any]:
-    """Expand ``all`` to every switch of [sim.effects] that is not named.
-
-    Raises:
-        ConfigError: ``all`` is neither true nor false, or a key is neither a switch nor ``all``.
-    """
+def _expand_all(effects: Mapping[str, Any]) -> dict[str, Any]:
+    """Expand ``all`` to every switch of [sim.effects] that is not named; refuse an unknown switch."""
     switches = {f.name for f in fields(SimEffects)}
     if unknown := sorted(set(effects) - switches - {ALL}):
         raise ConfigError(f"unknown key 'sim.effects.{unknown[0]}'; valid here: {choices({*switches, ALL})}")
@@ -313,13 +309,8 @@ def expand_all(effects: Mapping[str, Any]) -> dict[str, Any]:
     return {f.name: every for f in fields(SimEffects) if f.name not in QUALITY} | named
 
 
-def fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
-    """Scale the cameras' defaults to a given image size, or to a given focal length.
-
-    Args:
-        sim: configuration as read.
-        given: the [sim] table that it was read from; keys given there stay as they are.
-    """
+def _fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
+    """Scale the cameras' defaults to the image size or focal length of a [sim] table; keys given there stay."""
     cameras: dict[str, SimCamera] = {}
     for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
         said = given.get(name, {})
@@ -640,12 +631,12 @@ def parse_config(table: Mapping[str, Any]) -> RigConfig:
         targets[name] = validate(TargetProfile, values, f"targets.{name}", base=_of_kind(targets, name))
     sim_table = table.get("sim")
     if isinstance(sim_table, Mapping) and isinstance(sim_table.get("effects"), Mapping):
-        table["sim"] = {**sim_table, "effects": expand_all(sim_table["effects"])}
+        table["sim"] = {**sim_table, "effects": _expand_all(sim_table["effects"])}
     safety = table.get("safety")
     if isinstance(safety, Mapping) and safety.get("stop_file") is False:
         table["safety"] = {key: value for key, value in safety.items() if key != "stop_file"}
     config = validate(RigConfig, table, "")
-    config = dataclasses.replace(config, targets=targets, sim=fit_sizes(config.sim, table.get("sim", {})))
+    config = dataclasses.replace(config, targets=targets, sim=_fit_sizes(config.sim, table.get("sim", {})))
     check_corners(config.board)
     return config
 

@@ -40,16 +40,8 @@ def aim_error_figure(rows: Mapping[str, Sequence[Row]]) -> Figure:
         offset = np.array([100 * row.tpo_px / row.width_px if row.inside else np.nan for row in run])
         ax.plot(t, offset, lw=1.2, color=OFFSET, label="offset from the centre of the zoom image")
         out = np.array([not row.in_frame and row.in_wide for row in run])
-        ax.fill_between(
-            t,
-            0,
-            50,
-            where=out,
-            color="#d9534f",
-            alpha=0.15,
-            lw=0,
-            label="seen by the fixed camera, not in the close-up",
-        )
+        missed = "seen by the fixed camera, not in the close-up"
+        ax.fill_between(t, 0, 50, where=out, color="#d9534f", alpha=0.15, lw=0, label=missed)
         ax.set(ylim=(0, 50), xlim=(t[0], t[-1]), ylabel="offset [% of width]", title=name)
         zoom = ax.twinx()
         zoom.semilogy(t, [row.focal_px for row in run], lw=1.0, ls="--", color=FOCAL, label="focal length")
@@ -188,13 +180,9 @@ def draw_zoom(step: Step, factor: float = 1.0) -> Image:
     line = max(1, round(_scale_of(image)))
     u, v, near, far = image.shape[1] // 2, image.shape[0] // 2, 4 * line, 12 * line
     for colour, width in ((DARK, 3 * line), (CROSS, line)):
-        for a, b in (
-            ((u - far, v), (u - near, v)),
-            ((u + near, v), (u + far, v)),
-            ((u, v - far), (u, v - near)),
-            ((u, v + near), (u, v + far)),
-        ):
-            cv2.line(image, a, b, colour, width, cv2.LINE_AA)
+        for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            ends = ((u + du * away, v + dv * away) for away in (near, far))
+            cv2.line(image, *ends, colour, width, cv2.LINE_AA)
     return image
 
 
@@ -297,10 +285,7 @@ class TargetStages:
         if step.target is None:
             return image
         h, w = image.shape[:2]
-        part = (
-            max(2, round(w * self._shortest / step.lens.focal_px)),
-            max(2, round(h * self._shortest / step.lens.focal_px)),
-        )
+        part = [max(2, round(side * self._shortest / step.lens.focal_px)) for side in (w, h)]
         u, v = step.target.center_px
         cut = cv2.getRectSubPix(image, part, (float(u), float(v)))
         return np.asarray(cv2.resize(cut, (w, h), interpolation=cv2.INTER_NEAREST), np.uint8)

@@ -231,12 +231,7 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
 
 
 def _wiggle(rig: Rig, home: tuple[float, float], seconds: float) -> HeadLatency:
-    """Wiggle the head about a pan and tilt [rad] for some seconds, and compare its reports with the image's shift.
-
-    Raises:
-        CalibrationError: the image does not move with the head.
-        StaleFrameError: frames stopped coming.
-    """
+    """Wiggle the head about a pan and tilt [rad] for some seconds, and compare its reports with the image's shift."""
     pan, tilt = home
     low, high = rig.head.limits.pan
     way = WIGGLE if pan + WIGGLE <= high else -WIGGLE

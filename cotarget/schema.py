@@ -54,12 +54,8 @@ class Check:
         """Describe the check to pydantic."""
         from pydantic_core import core_schema
 
-        wrap = (
-            core_schema.no_info_before_validator_function
-            if self.before
-            else core_schema.no_info_after_validator_function
-        )
-        return wrap(self.function, handler(source))
+        before, after = core_schema.no_info_before_validator_function, core_schema.no_info_after_validator_function
+        return (before if self.before else after)(self.function, handler(source))
 
 
 class OneOf(Check):
@@ -255,11 +251,9 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
     if kind == "literal_error":
         return f"{at}: {value!r} is not one of: {choices(map(str, typing.get_args(bare(hint))))}"
     if kind == "value_error":
-        said, several = (
-            str(error["ctx"]["error"]),
-            dataclasses.is_dataclass(bare(hint)) or bare(hint) is RigidTransform,
-        )
-        return _join(at, (said,)) if several else f"{at}: {said}"
+        said = str(error["ctx"]["error"])
+        is_table = dataclasses.is_dataclass(bare(hint)) or bare(hint) is RigidTransform
+        return _join(at, (said,)) if is_table else f"{at}: {said}"
     if kind in WORDS:
         return f"{at}: {value!r} is not {WORDS[kind]}"
     if said := _out_of_range(error, hint):

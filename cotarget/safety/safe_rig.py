@@ -189,11 +189,7 @@ class SafeZoomCamera:
         return self._camera.focal_range
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
-
-        Raises:
-            StaleFrameError: no new frame came, or the newest is too old to act on.
-        """
+        """Read as `SafeCamera.read` does."""
         return self._stream.read(newer_than, timeout)
 
     def zoom(self, focal_px: float) -> float:
@@ -270,11 +266,7 @@ def clipped(pan: float, tilt: float, limits: PanTiltLimits) -> tuple[float, floa
 def _within(
     soft_deg: tuple[float, float] | None, device: tuple[float, float], step: float, name: str
 ) -> tuple[float, float]:
-    """Intersect soft limits [degrees] with the device's [rad].
-
-    Raises:
-        ConfigError: nothing is left.
-    """
+    """Intersect soft limits [degrees] with the device's [rad]."""
     if soft_deg is None:
         return device
     low, high = max(math.radians(soft_deg[0]), device[0]), min(math.radians(soft_deg[1]), device[1])
@@ -366,11 +358,7 @@ class _Guard:
         self.watchdog.stop(reason)
 
     def clear(self) -> str | None:
-        """End the emergency stop; return its reason.
-
-        Raises:
-            EmergencyStopError: a stop file exists.
-        """
+        """End the emergency stop, unless a stop file exists; return its reason."""
         return self.watchdog.clear()
 
     @property
@@ -379,11 +367,7 @@ class _Guard:
         return self.watchdog.reason
 
     def close(self) -> None:
-        """Halt the head, then close the rig; signals are deferred until that is done.
-
-        Raises:
-            Exception: as the device raised it when it could not be halted, or closed.
-        """
+        """Halt the head, then close the rig; signals are deferred until that is done."""
         self._close(deliver=True)
 
     def close_after(self, error: BaseException) -> None:

@@ -20,20 +20,10 @@ from cotarget.emulators.emulation import copied_tables
 from cotarget.errors import EmergencyStopError
 from cotarget.latency import Delay, HeadLatency
 from cotarget.safety.stop_file import refuse_if_stopped
-from tests.support.commands import call, refused, true_calibration
+from tests.support.commands import HARDWARE, NO_PORT, call, refused, true_calibration
 from tests.support.rigs import rig_of
 from tests.support.safety_rigs import SimulatedDevices
 
-NO_PORT = "/dev/nobody-is-here"
-HARDWARE = f"""
-backend = "hardware"
-[hardware.head]
-port = "{NO_PORT}"
-[hardware.fixed]
-url = "http://127.0.0.1:9"
-[hardware.zoom]
-port = "usb:"
-"""
 STOP_FILE = '\n[safety]\nstop_file = "run/stop"\n'
 
 

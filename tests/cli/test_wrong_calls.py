@@ -11,20 +11,21 @@ import pytest
 from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
 from cotarget.geometry import RigidTransform
-from tests.support.commands import OLD, bird_film, board_photo, call, capture, refused, true_calibration, write_index
+from tests.support.commands import (
+    HARDWARE,
+    NO_PORT,
+    OLD,
+    bird_film,
+    board_photo,
+    call,
+    capture,
+    refused,
+    true_calibration,
+    write_index,
+)
 from tests.support.rigs import with_zoom_head
 
 FAILED, USAGE = 1, 2
-NO_PORT = "/dev/nobody-is-here"
-HARDWARE = f"""
-backend = "hardware"
-[hardware.head]
-port = "{NO_PORT}"
-[hardware.fixed]
-url = "http://127.0.0.1:9"
-[hardware.zoom]
-port = "usb:"
-"""
 FILES = {
     "rig.toml": '[sim]\nscene = "indoor"\ntargets = ["book"]\n[safety]\nstop_file = "stop"\n',
     "sim.toml": "[sim]\n",

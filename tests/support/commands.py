@@ -15,6 +15,17 @@ from cotarget.video import FilmWriter
 
 OLD = "what was there before\n"
 FILM_HZ = 25.0
+# A rig of real devices, none of which is there.
+NO_PORT = "/dev/nobody-is-here"
+HARDWARE = f"""
+backend = "hardware"
+[hardware.head]
+port = "{NO_PORT}"
+[hardware.fixed]
+url = "http://127.0.0.1:9"
+[hardware.zoom]
+port = "usb:"
+"""
 
 
 def call(capsys, *arguments):
