@@ -81,17 +81,11 @@ def interrupts_kept_from_children() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def end_with_parent(*then: Callable[[], Any]) -> None:
-    """End this process as soon as its parent has ended in any way; call it first.
-
-    Args:
-        then: functions to call after that, for process pools that take only one initializer.
-    """
+def end_with_parent() -> None:
+    """End this process as soon as its parent has ended in any way; call it first."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_after, args=(parent.sentinel,), name="end with parent", daemon=True).start()
-    for each in then:
-        each()
 
 
 def _end_after(parent: int) -> None:
