@@ -181,8 +181,8 @@ def draw_zoom(step: Step, factor: float = 1.0) -> Image:
     u, v, near, far = image.shape[1] // 2, image.shape[0] // 2, 4 * line, 12 * line
     for colour, width in ((DARK, 3 * line), (CROSS, line)):
         for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-            ends = ((u + du * away, v + dv * away) for away in (near, far))
-            cv2.line(image, *ends, colour, width, cv2.LINE_AA)
+            a, b = ((u + du * away, v + dv * away) for away in (near, far))
+            cv2.line(image, a, b, colour, width, cv2.LINE_AA)
     return image
 
 

@@ -412,8 +412,8 @@ class _ZoomCamera(_Camera):
         if event is None:
             (focal,), moving = self._states.at(self._replay.now, "lens")
             return ZoomState(focal, moving, self._replay.now)
-        focal, moving, t = event.numbers
-        return ZoomState(focal, bool(moving), t)
+        focal, moves, t = event.numbers
+        return ZoomState(focal, bool(moves), t)
 
     def _by_time(self, newer_than: float | None, timeout: float) -> Event:
         """Return the newest frame read by now, or the first one within ``timeout``."""
@@ -446,8 +446,8 @@ class _Head:
         if event is None:
             (pan, tilt), moving = self._states.at(self._replay.now, "head")
             return PanTiltState(pan, tilt, moving, self._replay.now)
-        pan, tilt, moving, t = event.numbers
-        return PanTiltState(pan, tilt, bool(moving), t)
+        pan, tilt, moves, t = event.numbers
+        return PanTiltState(pan, tilt, bool(moves), t)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         recorded = self._replay.take("head.move")
