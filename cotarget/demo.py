@@ -103,7 +103,7 @@ def _calibrate(seed: int, work: Path, progress: Progress) -> dict[str, Any]:
     from cotarget.sim.world import SimWorld
 
     config = sim_config(CALIBRATION_SCENE, (), seed)
-    world = SimWorld(config)
+    world = SimWorld(config, ahead=False)  # rendering ahead takes another 200 MB
     with guard(world.rig, config.safety) as rig:
         calibration = calibrate(
             rig,

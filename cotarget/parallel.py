@@ -1,6 +1,7 @@
 """Run long jobs in processes of their own, which end with their parent."""
 
 import contextlib
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -15,6 +16,10 @@ Result = TypeVar("Result")
 # Called with what is done, how much there is (None where no end is known), and a text.
 Progress = Callable[[float, float | None, str], object]
 ORPHANED = 1  # exit status of a process whose parent has ended
+# Parameters of glibc's mallopt: one arena for all threads; blocks from MAPPED on [bytes] are mapped by themselves, so
+# that their memory is free as soon as they are. A run of the demo then takes 470 to 520 MB in place of 570.
+M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
+MAPPED = 262144
 
 
 def run_apart(job: Callable[..., Result], arguments: tuple[Any, ...], report: Callable[..., object]) -> Result:
@@ -57,6 +62,9 @@ def run_apart(job: Callable[..., Result], arguments: tuple[Any, ...], report: Ca
 def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> None:
     """Run the job in this process; send its progress and its result."""
     end_with_parent()
+    if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
+        mallopt(M_ARENA_MAX, 1)
+        mallopt(M_MMAP_THRESHOLD, MAPPED)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its jobs itself
 
     def report(*given: object) -> None:
