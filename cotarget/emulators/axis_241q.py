@@ -462,8 +462,6 @@ class AxisServer(TcpServer):
         faults: of `AXIS_FAULTS`; may be switched on and off at any time.
         sent: called for each part of each stream with the index of its image and the time at which its first byte is
             sent, on the machine's monotonic clock [s].
-        early_boundary: whether a stream's boundary is sent at once after an image, instead of just before the next; the
-            bytes are the same, but the first ones of a part come a frame period early.
         more: further or replaced parameters, by full names such as "root.Brand.ProdNbr".
 
     Raises:
@@ -482,13 +480,12 @@ class AxisServer(TcpServer):
         quality: int = 70,
         faults: Faults | None = None,
         sent: Callable[[int, float], None] = lambda index, t: None,
-        early_boundary: bool = False,
         more: Mapping[str, str] | None = None,
     ) -> None:
         self.faults = Faults(AXIS_FAULTS) if faults is None else faults
         self.pictures = Pictures(feeds, quality, self.faults)
         self.guard = Authenticator(user, password, auth, f"AXIS_{SERIAL}")
-        self.note_sent, self.early_boundary, self.more = sent, early_boundary, dict(more or {})
+        self.note_sent, self.more = sent, dict(more or {})
         self.seats = threading.BoundedSemaphore(VIEWERS)
         super().__init__(self._serve_request, host, port)
 
@@ -609,8 +606,7 @@ class Request(BaseHTTPRequestHandler):
             self._first(order)
             dashes = "--" if "dashed-boundary" in self.faults else ""
             kind = f"Content-Type: multipart/x-mixed-replace;boundary={dashes}{BOUNDARY[2:]}"
-            opening = f"{BOUNDARY}\r\n" if self.device.early_boundary else ""
-            self.connection.sendall(reply_head(HTTPStatus.OK, [kind]) + opening.encode())
+            self.connection.sendall(reply_head(HTTPStatus.OK, [kind]))
             for sent, (index, data) in enumerate(self._newest(order), 1):
                 if not self._part(index, data) or sent == order.count:
                     return
@@ -637,11 +633,8 @@ class Request(BaseHTTPRequestHandler):
 
     def _part(self, index: int, data: bytes) -> bool:
         headers, data = self._spoil(index, data)
-        early = self.device.early_boundary
-        head = "\r\n".join([*([] if early else [BOUNDARY]), *headers, "", ""])
-        tail = f"\r\n{BOUNDARY}\r\n" if early else "\r\n"
         self.device.note_sent(index, time.monotonic())
-        return self._send(head.encode(), data, tail.encode())
+        return self._send("\r\n".join([BOUNDARY, *headers, "", ""]).encode(), data, b"\r\n")
 
     def _spoil(self, index: int, data: bytes) -> tuple[list[str], bytes]:
         """Make the headers and bytes of an image, with the faults that are on."""

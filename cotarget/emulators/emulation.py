@@ -68,13 +68,11 @@ class Emulation:
             raise ConfigError(f"sim.zoom.size: {list(sim.zoom.size)} cannot be halved for the viewfinder")
         self.config, self._user = config, user
         self.faults = {device: Faults(names) for device, names in FAULTS.items()}
-        low, high = sim.head.pan_deg
-        pan_deg = (low, high) if PAN_SIGN > 0 else (-high, -low)
+        head, (lowest, highest) = sim.head, sim.head.pan_deg
         unit = UnitProfile.from_degrees(
-            pan_deg, sim.head.tilt_deg, sim.head.step_deg, sim.head.speed_deg_s, sim.head.accel_deg_s2
+            (-highest, -lowest), head.tilt_deg, head.step_deg, head.speed_deg_s, head.accel_deg_s2
         )
-        width, height = (side // PREVIEW_SHARE for side in sim.zoom.size)
-        self.preview_size = width, height
+        self.preview_size = sim.zoom.size[0] // PREVIEW_SHARE, sim.zoom.size[1] // PREVIEW_SHARE
         with contextlib.ExitStack() as opened:
             world = self.world = opened.enter_context(LiveWorld(config, pan_sign=PAN_SIGN))
             firmware = D46(world.pan, world.tilt, unit, self.faults["head"], world.clock.now)

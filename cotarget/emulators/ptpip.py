@@ -25,10 +25,8 @@ from cotarget.errors import CotargetError
 PARAMETERS = 5  # most parameters of an operation or a response
 LONGEST_STRING = 255  # UTF-16 units, with the closing zero
 ARRAY = 0x4000  # set in the data type of an array
-INT8, UINT8, INT16, UINT16, INT32, UINT32, INT64, UINT64 = range(1, 9)
-STRING = 0xFFFF
-SIGNED = (INT8, INT16, INT32, INT64)
-WIDTHS = {INT8: 1, UINT8: 1, INT16: 2, UINT16: 2, INT32: 4, UINT32: 4, INT64: 8, UINT64: 8}  # bytes
+UINT8, UINT16, UINT32, STRING = 2, 4, 6, 0xFFFF  # data types
+WIDTHS = {UINT8: 1, UINT16: 2, UINT32: 4}  # bytes
 JPEG = 0x3801  # the object format: EXIF
 Value = int | str | tuple[int, ...]
 
@@ -99,7 +97,7 @@ def encode(kind: int, value: Value) -> bytes:
         return string(value)
     if isinstance(value, tuple):
         return array(value, kind & ~ARRAY)
-    return value.to_bytes(WIDTHS[kind], "little", signed=kind in SIGNED)
+    return value.to_bytes(WIDTHS[kind], "little")
 
 
 def decode(kind: int, data: bytes) -> Value:
@@ -114,13 +112,13 @@ def decode(kind: int, data: bytes) -> Value:
         return data[1:].decode("utf-16-le", "replace").partition("\0")[0]
     if kind & ~ARRAY not in WIDTHS:
         raise PtpError(f"PTP: unknown data type {kind:#06x}")
-    width, signed = WIDTHS[kind & ~ARRAY], kind & ~ARRAY in SIGNED
+    width = WIDTHS[kind & ~ARRAY]
     head = 4 if kind & ARRAY else 0
     count = int.from_bytes(data[:4], "little") if head else 1
     if len(data) != head + count * width:
         raise PtpError(f"PTP: {len(data)} bytes are no value of type {kind:#06x}")
     places = range(head, len(data), width)
-    found = tuple(int.from_bytes(data[at : at + width], "little", signed=signed) for at in places)
+    found = tuple(int.from_bytes(data[at : at + width], "little") for at in places)
     return found if head else found[0]
 
 

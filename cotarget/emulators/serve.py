@@ -175,7 +175,6 @@ class JsonLines(TcpServer):
 # The serial line
 
 BITS = 10  # of a byte: start, eight, stop
-BACKLOG = 4096  # most bytes under way to the firmware; beyond that the sender must wait
 
 
 class Firmware(Protocol):
@@ -211,11 +210,6 @@ class Wire:
         self._in: deque[tuple[float, int, int | None]] = deque()
         self._out: deque[tuple[float, int, int]] = deque()
         self._in_free = self._out_free = 0.0
-
-    @property
-    def room(self) -> int:
-        """Number of further bytes that can be under way to the firmware."""
-        return max(BACKLOG - len(self._in), 0)
 
     def feed(self, data: bytes, now: float, baud: int | None = None) -> None:
         """Put bytes from the client on the wire.
@@ -264,6 +258,7 @@ class Wire:
 # Ports of a unit
 
 TICK_S = 0.005  # period of asking an idle firmware for output, and of checking whether the ports close [s]
+RECEIVE = 4096  # bytes
 SEND_TIMEOUT_S = 1.0  # a TCP client that reads nothing for this time is dropped [s]
 SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 CODES = {baud: code for code, baud in SPEEDS.items()}
@@ -371,20 +366,16 @@ class UnitPorts:
             self._send(arrived)
         due = self._wire.due()
         timeout = TICK_S if due is None else min(max(due - time.monotonic(), 0.0), TICK_S)
-        sources: list[Any] = [] if self._listener is None else [self._listener]
-        if self._wire.room:
-            sources += [] if self._client is None else [self._client]
-            sources += [] if self._ends is None else [self._ends[0]]
-        ready = select.select(sources, [], [], timeout)[0]
-        for source in ready:
+        sources = (self._listener, self._client, None if self._ends is None else self._ends[0])
+        for source in select.select([source for source in sources if source is not None], [], [], timeout)[0]:
             if source is self._listener:
                 self._admit()
             elif source is self._client:
                 self._hear()
             elif self._ends is not None and source == self._ends[0]:
                 with contextlib.suppress(BlockingIOError):
-                    data = os.read(source, self._wire.room)
-                    if self._client is None:  # the port is locked by the client on TCP
+                    data = os.read(source, RECEIVE)
+                    if self._client is None:  # otherwise the port is locked
                         self._wire.feed(data, time.monotonic(), self._baud())
 
     def _baud(self) -> int | None:
@@ -406,7 +397,7 @@ class UnitPorts:
     def _hear(self) -> None:
         assert self._client is not None
         try:
-            data = self._client.recv(self._wire.room)
+            data = self._client.recv(RECEIVE)
         except OSError:
             data = b""
         if data:

@@ -308,18 +308,6 @@ def test_a_stream_byte_for_byte(server, feed):
 
 
 @pytest.mark.wire
-def test_a_boundary_may_come_with_the_picture_before_it(feed):
-    with (
-        AxisServer({1: feed}, early_boundary=True) as server,
-        Viewer(server, head=STREAM_HEAD + b"--myboundary\r\n") as viewer,
-    ):
-        # Nothing more is published, so that the boundary after the picture can only have come with it.
-        jpeg = body(exchange(server, SNAPSHOT))
-        part = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg) + jpeg + b"\r\n--myboundary\r\n"
-        assert viewer.stream.read(len(part)) == part
-
-
-@pytest.mark.wire
 def test_sizes_and_compression_as_asked(server, feed):
     publish(feed, 1, np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8))
     for asked, size in [("CIF", (352, 288)), ("2CIF", (704, 288)), ("4CIF", (704, 576)), ("64x48", (64, 48))]:

@@ -114,9 +114,8 @@ def ffmpeg_frames(url, count, size=SIZE):
     return np.frombuffer(raw, np.uint8).reshape(count, size[1], size[0], 3)
 
 
-@pytest.mark.parametrize("early_boundary", [False, True])
-def test_ffmpeg_decodes_a_stream(early_boundary):
-    with emulated(early_boundary=early_boundary) as server:
+def test_ffmpeg_decodes_a_stream():
+    with emulated() as server:
         frames = ffmpeg_frames(f"{server.url}{STREAM}?camera=1&fps=25", 12)
     assert consecutive([number_of(frame) for frame in frames])
 
