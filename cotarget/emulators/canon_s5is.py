@@ -2,9 +2,9 @@
 
 It announces the operations, events and properties of a real camera, as one reported them to gphoto2 in July 2008
 (libgphoto2, camlibs/ptp2/cameras/canon-s5.txt), except for the serial number, and for image size and quality, which are
-at their best. It carries out what remote shooting needs and refuses the rest as not supported. It has no card: a still
-stays in memory until the next one, or until the camera is switched off. Stills always have their full size; exposure
-settings are stored and have no effect.
+at their best. It carries out what libgphoto2 sends for remote shooting and refuses the rest as not supported. It has no
+card: a still stays in memory until the next one, or until the camera is switched off. Stills always have their full
+size; exposure settings are stored and have no effect.
 
 Behaviour that was not measured on a real camera is chosen so that a driver for this emulator expects little:
 
@@ -56,18 +56,16 @@ log = logging.getLogger(__name__)
 
 # Viewfinder and stills
 
-THUMB_SIZE = (160, 120)  # px
 PICTURE_WAIT_S = 1.0  # time limit for the viewfinder's next image [s]
 SLICE_S = 0.1  # period of checking whether the viewfinder is still on [s]
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """A still as JPEG, its size [px], and its thumbnail as JPEG."""
+    """A still as JPEG, and its size [px]."""
 
     jpeg: bytes
     size: tuple[int, int]
-    thumb: bytes
 
 
 class Viewfinder:
@@ -137,8 +135,7 @@ class Shutter:
             log.warning("no still: %s", error)
             done(None)
             return
-        jpeg, thumb = encode_jpeg(image, self._quality), encode_jpeg(image, self._quality, THUMB_SIZE)
-        done(Exposure(jpeg, (image.shape[1], image.shape[0]), thumb))
+        done(Exposure(encode_jpeg(image, self._quality), (image.shape[1], image.shape[0])))
 
 
 # Operations
@@ -149,12 +146,12 @@ ALREADY_SO, REFUSED = 0xA009, 0xA005  # Canon's response codes: already in that 
 OBJECT_TRANSFER, MODE_CHANGED, CAPTURE_COMPLETE = 0xC009, 0xC00C, 0x400D  # events
 INTERRUPTING, CHECKED = (1, 2, 3, 4, 5), (3, 4, 5, 7)  # event modes: sent at once, fetched by CheckEvent
 EVENT_CONTAINER = 4  # type of an event container in PTP over USB, whose layout CheckEvent uses
-INFO, OPEN, CLOSE, SET_VALUE, RESET_VALUE = 0x1001, 0x1002, 0x1003, 0x1016, 0x1017
+INFO, OPEN, CLOSE, SET_VALUE = 0x1001, 0x1002, 0x1003, 0x1016
 START_SHOOTING, END_SHOOTING, VIEWFINDER_ON, VIEWFINDER_OFF = 0x9008, 0x9009, 0x900B, 0x900C
-CAPTURE, VIEWFINDER_IMAGE, FOCUS_LOCK, FOCUS_UNLOCK = 0x901A, 0x901D, 0x9014, 0x9015
-SHOOTING_ONLY = frozenset((VIEWFINDER_ON, VIEWFINDER_OFF, CAPTURE, VIEWFINDER_IMAGE, FOCUS_LOCK, FOCUS_UNLOCK))
+CAPTURE, VIEWFINDER_IMAGE = 0x901A, 0x901D
+SHOOTING_ONLY = frozenset((VIEWFINDER_ON, VIEWFINDER_OFF, CAPTURE, VIEWFINDER_IMAGE))
 # Operations that a busy camera refuses; queries and events still work.
-NOT_WHEN_BUSY = SHOOTING_ONLY | {SET_VALUE, RESET_VALUE, START_SHOOTING, END_SHOOTING}
+NOT_WHEN_BUSY = SHOOTING_ONLY | {SET_VALUE, START_SHOOTING, END_SHOOTING}
 
 
 class CodeError(Exception):
@@ -199,10 +196,8 @@ class S5isCamera:
             0x1007: lambda words: array([], UINT32),  # objects; stills in memory are not listed
             0x1008: lambda words: self._still_info(words[0]),
             0x1009: lambda words: self._still(words[0])[1].jpeg,
-            0x100A: lambda words: self._still(words[0])[1].thumb,
             0x1014: lambda words: self._property(words[0]).describe(self._values[words[0]]),
             0x1015: lambda words: encode(self._property(words[0]).kind, self._values[words[0]]),
-            0x101B: lambda words: self._still(words[0])[1].jpeg[words[1] :][: words[2]],
             0x9013: lambda words: self._events.popleft() if self._events else b"",
         }
         # Operations that change something, with the initiator's data.
@@ -210,13 +205,10 @@ class S5isCamera:
             OPEN: lambda words, data: self._open(words[0]),
             CLOSE: lambda words, data: self.disconnected(),
             SET_VALUE: lambda words, data: self._set(words[0], data),
-            RESET_VALUE: lambda words, data: self._set(words[0], None),
             START_SHOOTING: lambda words, data: self._shoot(True),
             END_SHOOTING: lambda words, data: self._shoot(False),
             VIEWFINDER_ON: lambda words, data: self._viewfinder.switch(True),
             VIEWFINDER_OFF: lambda words, data: self._viewfinder.switch(False),
-            FOCUS_LOCK: lambda words, data: None,
-            FOCUS_UNLOCK: lambda words, data: None,
             CAPTURE: lambda words, data: self._capture(),
         }
 
@@ -290,16 +282,15 @@ class S5isCamera:
             raise CodeError(Code.PROPERTY_NOT_SUPPORTED)
         return prop
 
-    def _set(self, code: int, data: bytes | None) -> None:
-        """Set a property to a coded value, or to its default."""
+    def _set(self, code: int, data: bytes) -> None:
         prop = self._property(code)
         if not prop.writable:
             raise CodeError(Code.ACCESS_DENIED)
         try:
-            value = prop.default if data is None else decode(prop.kind, data)
+            value = decode(prop.kind, data)
         except PtpError:
             raise CodeError(Code.INVALID_PROPERTY_FORMAT) from None
-        if data is not None and not prop.allows(value):
+        if not prop.allows(value):
             raise CodeError(Code.INVALID_PROPERTY_VALUE)
         self._values[code] = value
         if code == ZOOM and isinstance(value, int):
@@ -348,7 +339,7 @@ class S5isCamera:
     def _still_info(self, handle: int) -> bytes:
         _, still, date = self._still(handle)
         name = f"IMG_{handle - FIRST_HANDLE:04d}.JPG"
-        return ObjectInfo(MEMORY, len(still.jpeg), still.size, len(still.thumb), THUMB_SIZE, name, date).pack()
+        return ObjectInfo(MEMORY, len(still.jpeg), still.size, name, date).pack()
 
 
 # Tables of operations, events and properties

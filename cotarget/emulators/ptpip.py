@@ -207,16 +207,14 @@ class ObjectInfo:
     storage: int
     length: int
     size: tuple[int, int]
-    thumb_length: int
-    thumb_size: tuple[int, int]
     name: str
     date: str  # of the capture, as "20080721T095816"
 
     def pack(self) -> bytes:
-        """Encode the dataset of a JPEG (EXIF) image without a folder."""
+        """Encode the dataset of a JPEG (EXIF) image without a folder and without a thumbnail."""
         plain = 0
         head = struct.pack("<IHHI", self.storage, JPEG, plain, self.length)
-        thumb = struct.pack("<HIII", JPEG, self.thumb_length, *self.thumb_size)
+        thumb = struct.pack("<HIII", 0, 0, 0, 0)
         rest = struct.pack("<IIIIHII", *self.size, 24, 0, 0, 0, 0)  # bits a pixel; parent, kind of folder, ..., number
         return head + thumb + rest + string(self.name) + string(self.date) * 2 + string("")
 

@@ -18,7 +18,7 @@ import serial
 
 from cotarget.backends import describe, load_config, open_recording
 from cotarget.calibration import load_calibration
-from cotarget.config import RigConfig
+from cotarget.config import RigConfig, config_of
 from cotarget.emulators.emulation import FAULTS
 from cotarget.emulators.process import EmulatedRig
 from cotarget.errors import DeviceError
@@ -153,6 +153,13 @@ def stays_within_limits(watch):
 def test_an_emulator_that_does_not_start_says_why(tmp_path):
     with pytest.raises(DeviceError, match=r"did not start: cotarget emulate: .*nowhere"):
         EmulatedRig(tmp_path, {"sim": {"scene": "nowhere"}})
+
+
+@stands
+def test_an_unknown_fault_is_refused(rig):
+    with pytest.raises(DeviceError, match="those of zoom are: busy, cut"):
+        rig.switch("zoom.rust")
+    assert rig.config() == config_of(rig.hardware_toml.read_text(), rig.hardware_toml)
 
 
 @stands

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import RigConfig, SimConfig, parse_config
+from cotarget.emulators.faults import Faults
 from cotarget.emulators.serve import JsonLines
 from cotarget.emulators.world import FIXED_HZ, OLDEST, ZOOM_HZ, EmulatedAxis, EmulatedLens, LiveWorld, WallClock, paced
 from cotarget.errors import ConfigError, DeviceError
@@ -127,6 +128,11 @@ def test_a_lens_goes_where_it_is_sent_and_no_farther_than_it_can(clock):
     plant.command(-3)
     clock.t = 40.0
     assert (plant.position(), plant.moving()) == (0, False)
+
+
+def test_an_unknown_fault_is_refused():
+    with pytest.raises(ConfigError, match="'rust'.*: cut, stall"):
+        Faults(["stall", "cut"]).set("rust")
 
 
 def test_real_time_is_kept_by_fewer_frames_and_plainer_ones():
@@ -293,6 +299,10 @@ def test_a_server_of_lines_hangs_up_and_gives_its_port_back():
             lines.write(b'{"a": 1}\n')
             lines.flush()
             assert lines.readline() == b'{"a": 1}\n'
+            for wrong in (b"nonsense\n", b"[" * 60000 + b"\n"):
+                lines.write(wrong)
+                lines.flush()
+                assert lines.readline().startswith(b'{"error": "not understood: ')
             server.close()
             assert lines.readline() == b""
     with JsonLines(lambda said: said, port=server.port):
