@@ -131,7 +131,7 @@ def test_a_lens_goes_where_it_is_sent_and_no_farther_than_it_can(clock):
 
 
 def test_an_unknown_fault_is_refused():
-    with pytest.raises(ConfigError, match="'rust'.*: cut, stall"):
+    with pytest.raises(ConfigError, match=r"'rust'.*: cut, stall"):
         Faults(["stall", "cut"]).set("rust")
 
 
