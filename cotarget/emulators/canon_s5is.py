@@ -34,13 +34,13 @@ from cotarget.emulators.ptpip import (
     UINT8,
     UINT16,
     UINT32,
-    Answer,
     Code,
     DeviceInfo,
     ObjectInfo,
     Property,
     PtpError,
     PtpIpServer,
+    PtpReply,
     Range,
     Value,
     array,
@@ -159,7 +159,7 @@ class CodeError(Exception):
 
     def __init__(self, code: int, *parameters: int) -> None:
         super().__init__(f"{code:#06x}")
-        self.answer = Answer(code, parameters)
+        self.answer = PtpReply(code, parameters)
 
 
 class S5isCamera:
@@ -212,29 +212,29 @@ class S5isCamera:
             CAPTURE: lambda words, data: self._capture(),
         }
 
-    def operate(self, code: int, parameters: tuple[int, ...], data: bytes) -> Answer:
+    def operate(self, code: int, parameters: tuple[int, ...], data: bytes) -> PtpReply:
         """Carry out an operation, with five parameters and its data."""
         with self._lock:
             if code == INFO:
-                return Answer(data=self._info())
+                return PtpReply(data=self._info())
             if not self._session and code != OPEN:
-                return Answer(Code.SESSION_NOT_OPEN)
+                return PtpReply(Code.SESSION_NOT_OPEN)
             if code in NOT_WHEN_BUSY and (self._exposure is not None or "busy" in self._faults):
-                return Answer(Code.DEVICE_BUSY)
+                return PtpReply(Code.DEVICE_BUSY)
             if code in SHOOTING_ONLY and not self._shooting:
-                return Answer(REFUSED)
+                return PtpReply(REFUSED)
             try:
                 if code in self._data:
-                    return Answer(data=self._data[code](parameters))
+                    return PtpReply(data=self._data[code](parameters))
                 if code in self._actions:
                     self._actions[code](parameters, data)
-                    return Answer()
+                    return PtpReply()
             except CodeError as error:
                 return error.answer
         if code == VIEWFINDER_IMAGE:  # waits outside of the lock, so that a power-off is not delayed
             image = self._viewfinder.image()
-            return Answer(Code.DEVICE_BUSY) if image is None else Answer(parameters=(len(image),), data=image)
-        return Answer(Code.OPERATION_NOT_SUPPORTED)
+            return PtpReply(Code.DEVICE_BUSY) if image is None else PtpReply(parameters=(len(image),), data=image)
+        return PtpReply(Code.OPERATION_NOT_SUPPORTED)
 
     def disconnected(self) -> None:
         """Close the session; the camera stays in shooting mode, with its viewfinder off."""

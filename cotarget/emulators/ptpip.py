@@ -53,7 +53,7 @@ class PtpError(CotargetError):
 
 
 @dataclass(frozen=True)
-class Answer:
+class PtpReply:
     """A device's answer to an operation.
 
     Attributes:
@@ -70,7 +70,7 @@ class Answer:
 class PtpDevice(Protocol):
     """A device behind a responder."""
 
-    def operate(self, code: int, parameters: tuple[int, ...], data: bytes) -> Answer:
+    def operate(self, code: int, parameters: tuple[int, ...], data: bytes) -> PtpReply:
         """Carry out an operation, with five parameters (0 where one was not sent) and its data."""
 
     def disconnected(self) -> None:

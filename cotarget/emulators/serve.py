@@ -26,7 +26,7 @@ from cotarget.errors import CotargetError, DeviceError
 LOCAL, HIGHEST_PORT = "127.0.0.1", 65535
 
 
-def listen(host: str, port: int) -> socket.socket:
+def open_listener(host: str, port: int) -> socket.socket:
     """Open a listening socket.
 
     Raises:
@@ -70,7 +70,7 @@ class TcpServer:
         absent: Callable[[], bool] = lambda: False,
     ) -> None:
         self._serve, self._absent = serve, absent
-        self._listener: socket.socket | None = listen(host, port)
+        self._listener: socket.socket | None = open_listener(host, port)
         self.host, self.port = host, int(self._listener.getsockname()[1])
         self.closing = threading.Event()
         self._lock = threading.Lock()
@@ -102,7 +102,7 @@ class TcpServer:
                 self.closing.wait(LOOK_S)
                 continue
             try:
-                self._listener = self._listener or listen(self.host, self.port)
+                self._listener = self._listener or open_listener(self.host, self.port)
             except DeviceError:  # another program has the port for now
                 self.closing.wait(LOOK_S)
                 continue
@@ -287,7 +287,7 @@ class UnitPorts:
         self._firmware, self._wire, self._serial = firmware, Wire(firmware), serial
         self._ends: tuple[int, int] | None = None  # emulator's and client's end; the latter stays open here too,
         self.port = ""  # because without any open client's end the emulator's fails
-        self._listener = None if tcp is None else listen(host, tcp)
+        self._listener = None if tcp is None else open_listener(host, tcp)
         self._address = None if self._listener is None else (host, int(self._listener.getsockname()[1]))
         self._client: socket.socket | None = None
         try:
@@ -335,7 +335,7 @@ class UnitPorts:
 
     def _plug_in(self) -> None:
         if self._address is not None and self._listener is None:
-            self._listener = listen(*self._address)
+            self._listener = open_listener(*self._address)
         if not self._serial:
             return
         master, slave = os.openpty()

@@ -11,7 +11,6 @@ from cotarget.emulators import ptpip
 from cotarget.emulators.canon_s5is import OPERATIONS, S5IS_FAULTS, Exposure, S5isCamera
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptpip import (
-    Answer,
     Code,
     CommandSession,
     DeviceInfo,
@@ -19,6 +18,7 @@ from cotarget.emulators.ptpip import (
     ObjectInfo,
     Property,
     PtpError,
+    PtpReply,
     Range,
     data_phase,
     packet,
@@ -143,7 +143,7 @@ class Echo:
 
     def operate(self, code, parameters, data):
         self.asked.append((code, parameters, data))
-        return Answer(data=data) if code == ECHO else Answer()
+        return PtpReply(data=data) if code == ECHO else PtpReply()
 
     def disconnected(self):
         self.asked.append("disconnected")

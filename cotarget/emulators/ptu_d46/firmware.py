@@ -16,11 +16,11 @@ from typing import Any
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import AxisPlant
 from cotarget.emulators.ptu_d46.unit import (
-    AxisSettings,
     RefusalError,
     Task,
     Unit,
     UnitAxis,
+    UnitAxisSettings,
     UnitProfile,
     refuse_beyond,
 )
@@ -60,7 +60,7 @@ POWER = {"R": "REGULAR", "L": "LOW", "O": "OFF", "H": "HIGH"}
 
 
 def _bound(
-    letter: str, name: str, allowed: Callable[[Unit, AxisSettings, int], bool], sentence: str | None = None
+    letter: str, name: str, allowed: Callable[[Unit, UnitAxisSettings, int], bool], sentence: str | None = None
 ) -> Command:
     """Describe the command of an axis's bound, set once the axis stands; without a sentence, of its acceleration."""
 

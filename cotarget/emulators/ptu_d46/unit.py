@@ -259,7 +259,7 @@ def plain_acceleration(distance: float, speed: float, base: float, acceleration:
 
 
 @dataclass
-class AxisSettings:
+class UnitAxisSettings:
     """Settings of an axis, which DS saves; in steps and seconds."""
 
     speed: int
@@ -287,7 +287,7 @@ class UnitAxis:
         self.name = name
         self.letter = name[0]
         self.plant = plant
-        self.settings = AxisSettings(
+        self.settings = UnitAxisSettings(
             unit.speed, unit.acceleration, unit.base_speed, unit.highest_speed, unit.lowest_speed, *limits
         )
         self.calibrated = True
@@ -427,8 +427,8 @@ class Settings:
         network_id: number on a shared line; 0 for a unit that is alone on its line.
     """
 
-    pan: AxisSettings
-    tilt: AxisSettings
+    pan: UnitAxisSettings
+    tilt: UnitAxisSettings
     echo: str = "E"
     feedback: str = "V"
     limits: str = "E"
