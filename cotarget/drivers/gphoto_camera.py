@@ -177,13 +177,7 @@ def patiently(clock: Clock, call: Callable[[], T]) -> T:
 
 
 def set_up(link: CameraLink, config: GphotoSettings, clock: Clock, camera: str) -> ZoomSetting:
-    """Switch an opened camera to shooting mode and apply the configured settings.
-
-    Args:
-        link: to the camera, open.
-        config: settings, lens table and sizes of the zoom camera.
-        clock: the rig's clock.
-        camera: name of the camera, for messages.
+    """Switch an opened camera, of a name for messages, to shooting mode and apply the configured settings.
 
     Raises:
         ConfigError: the camera has no such setting or value, or cannot be zoomed as configured.
@@ -539,14 +533,7 @@ FIRST_PAUSE_S, RECONNECT_S = 0.1, 5.0
 
 
 class Shooting:
-    """Open the camera and run its jobs; all methods are called from one thread.
-
-    Args:
-        config: the zoom camera's configuration.
-        clock: the rig's clock.
-        link: to the camera, not open yet.
-        shared: commands and results.
-    """
+    """Open the camera and run its jobs; all methods are called from one thread."""
 
     def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
@@ -776,7 +763,7 @@ class GphotoCamera:
 
         Raises:
             ConfigError: stills have another size than configured.
-            DeviceError: the camera took no still.
+            DeviceError: the camera took no still, or is gone.
         """
         shared = self._shared
         with self._still_turn:

@@ -7,7 +7,7 @@ import pytest
 from cotarget.errors import DeviceError
 from tests.support.device_ways import HEADS, contract, settle
 
-AT_ONCE_S = 0.5  # a command or a halt does not wait for the head, which takes longer for its range
+AT_ONCE_S = 1.0  # a command or a halt does not wait for the head, which takes longer for its range
 ROUNDING = 1e-9
 SLOW = 0.5  # rad/s
 FAR = 0.4  # rad
