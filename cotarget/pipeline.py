@@ -200,7 +200,7 @@ class State(enum.StrEnum):
 
     SEARCHING = "searching"  # nothing to follow; the lens is at its shortest
     FOLLOWING = "following"  # the head follows the target
-    UNCONFIRMED = "unconfirmed"  # likewise, but the zoom camera should have shown the target for seconds and has not
+    UNCONFIRMED = "unconfirmed"  # following, but the zoom camera should have shown the target for seconds and has not
     COASTING = "coasting"  # the target is out of sight for a moment; the head follows its prediction
     LOST = "lost"  # out of sight for longer: the lens zooms out; the head goes on while the prediction is certain
     UNREACHABLE = "unreachable"  # the target is seen but cannot be aimed at
