@@ -30,7 +30,7 @@ from cotarget.cli.common import (
     scores_of,
 )
 from cotarget.errors import ConfigError, choices
-from cotarget.files import STDOUT
+from cotarget.files import STDOUT, CsvFile
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
@@ -189,7 +189,7 @@ def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
     from cotarget.pipeline import follow
-    from cotarget.recording.recorder import StepTable, utc_text
+    from cotarget.recording.recorder import COLUMNS, step_row, utc_text
     from cotarget.recording.replay import until_end
     from cotarget.video import FilmWriter
 
@@ -201,14 +201,13 @@ def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
     interrupt: KeyboardInterrupt | None = None
     try:
         with (
-            StepTable(options.csv, keep=True) as table,
+            CsvFile(options.csv, COLUMNS, keep=True) if options.csv else nullcontext() as table,
             FilmWriter(options.video, run.rate_hz, keep=True) if options.video else nullcontext() as film,
             progress_bar() as progress,
             run.open_rig() as rig,
         ):
             if run.config.backend == "hardware" and run.replay is None:
                 epoch = datetime.now(UTC) - timedelta(seconds=rig.clock.now())
-            table.epoch = epoch
             if film is not None:
                 film.epoch = epoch
             selector = run.selection.selector
@@ -216,7 +215,8 @@ def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
             steps = follow(rig, run.calibration, target, detector, selector=selector, seconds=run.seconds, insist=True)
             try:
                 for step in until_end(steps, run.replay):
-                    table.write(step)
+                    if table is not None:
+                        table.write(step_row(step, epoch))
                     for observer in observers:
                         observer.see(step)
                     if film is not None:

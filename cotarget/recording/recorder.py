@@ -1,6 +1,6 @@
 """Record a run: a table of its Steps, and every call on its rig with the result.
 
-`StepTable` writes the CSV. `Recorder` makes the folder of a recording and gives the rig devices that log calls and
+`step_row` makes its lines. `Recorder` makes the folder of a recording and gives the rig devices that log calls and
 results in order and change neither. `RecordWriter` writes log and images on a thread of its own, so that the
 run does not wait for the disk.
 """
@@ -29,7 +29,6 @@ import cotarget.errors
 from cotarget.config import RigConfig, config_table
 from cotarget.control.selection import TargetSelector, selector_table
 from cotarget.errors import ConfigError, CotargetError
-from cotarget.files import CsvFile
 from cotarget.pipeline import Step
 from cotarget.recording.format import (
     CALIBRATION,
@@ -282,60 +281,24 @@ def utc_text(epoch: datetime, t: float) -> str:
     return (epoch + timedelta(seconds=t)).isoformat(timespec="milliseconds")
 
 
-class StepTable:
-    """CSV table of Steps, one line each, which appears under its name when complete; a context manager.
+def step_row(step: Step, epoch: datetime | None = None) -> list[object]:
+    """Make a Step's line of the table with `COLUMNS`.
 
-    Attributes:
-        epoch: wall-clock time at which the rig's clock showed 0, from which the column ``utc`` is made; None if the
-            rig's time is simulated, and the column stays empty.
+    Args:
+        step: the Step.
+        epoch: wall-clock time at which the rig's clock showed 0, for the column ``utc``; None if the rig's time is
+            simulated, and the column stays empty.
     """
-
-    def __init__(self, path: Path | None, *, keep: bool = False) -> None:
-        """Prepare to write to ``path``, or nowhere if it is None.
-
-        Args:
-            path: of the file.
-            keep: whether to keep the lines so far if the block ends in an error.
-
-        Raises:
-            ConfigError: the file cannot be written.
-        """
-        self.epoch: datetime | None = None
-        self._file = None if path is None else CsvFile(path, COLUMNS, keep=keep)
-
-    def write(self, step: Step) -> None:
-        """Append a Step.
-
-        Raises:
-            ConfigError: the disk is full.
-        """
-        if self._file is None:
-            return
-        track, aim, (pan, tilt, focal) = step.target, step.aim, step.commanded
-        box = ["", "", "", "", ""] if track is None else [track.id, *track.center_px, *track.size_px]
-        row = (
-            [step.index, step.t, step.fixed.t, step.zoom.t, step.state, step.reason, *box]
-            + (["", ""] if aim is None else [aim.depth, aim.range])
-            + [math.degrees(pan), math.degrees(tilt), focal]
-            + [math.degrees(step.head.pan), math.degrees(step.head.tilt), step.lens.focal_px]
-            + ["" if self.epoch is None else utc_text(self.epoch, step.fixed.t), step.skipped]
-        )
-        self._file.write(cell + 0.0 if isinstance(cell, float) else cell for cell in row)  # no -0.0
-
-    def __enter__(self) -> "StepTable":
-        """Return the table itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Complete the file and give it its name; after an error remove it, or keep its lines.
-
-        Raises:
-            ConfigError: the file could not be completed, as on a full disk.
-        """
-        if self._file is not None:
-            self._file.__exit__(kind, error, trace)
+    track, aim, (pan, tilt, focal) = step.target, step.aim, step.commanded
+    box = ["", "", "", "", ""] if track is None else [track.id, *track.center_px, *track.size_px]
+    row = (
+        [step.index, step.t, step.fixed.t, step.zoom.t, step.state, step.reason, *box]
+        + (["", ""] if aim is None else [aim.depth, aim.range])
+        + [math.degrees(pan), math.degrees(tilt), focal]
+        + [math.degrees(step.head.pan), math.degrees(step.head.tilt), step.lens.focal_px]
+        + ["" if epoch is None else utc_text(epoch, step.fixed.t), step.skipped]
+    )
+    return [cell + 0.0 if isinstance(cell, float) else cell for cell in row]  # no -0.0
 
 
 class Recorder:

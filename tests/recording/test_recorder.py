@@ -1,6 +1,5 @@
 """What a run leaves: the table of Steps, complete or not there at all; and its recording, whole whenever it stops."""
 
-import csv
 import dataclasses
 import errno
 import json
@@ -20,7 +19,7 @@ from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.pipeline import State, Step
 from cotarget.recording import recorder as writing
 from cotarget.recording.format import CALLS, Event, event_line, parse_event
-from cotarget.recording.recorder import COLUMNS, Recorder, StepTable
+from cotarget.recording.recorder import COLUMNS, Recorder, step_row
 from cotarget.recording.replay import Replay
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.targeting import Aim
@@ -55,59 +54,21 @@ def step(index=0, found=True):
     )
 
 
-def test_one_line_a_step(tmp_path):
-    path = tmp_path / "steps.csv"
-    with StepTable(path) as table:
-        table.write(step(0))
-        assert not path.exists()  # not before it is complete
-        table.write(step(1, found=False))
-    with path.open(newline="") as file:
-        first, second = csv.DictReader(file)
-    assert tuple(first) == COLUMNS
+def test_one_line_a_step():
+    first, second = (dict(zip(COLUMNS, step_row(step(found=found)), strict=True)) for found in (True, False))
     numbers = {"index": 0, "t_s": 0.56, "t_fixed_s": 0.5, "t_zoom_s": 0.48, "track": 7, "u_px": 10, "v_px": 20,
                "width_px": 3, "height_px": 4, "depth_m": 10, "range_m": 10.5, "pan_commanded_deg": 30,
                "tilt_commanded_deg": -20, "focal_commanded_px": 4800, "pan_deg": 29, "tilt_deg": -19,
                "focal_px": 4700}  # fmt: skip
     assert {name: float(first[name]) for name in numbers} == pytest.approx(numbers)
-    assert (first["state"], first["reason"]) == ("following", "")
+    assert (first["state"], first["reason"], first["utc"]) == ("following", "", "")
     assert (second["state"], second["reason"]) == ("lost", 'out of sight, says "it"\nfor 0.5 s')
     assert {second[name] for name in ("track", "u_px", "width_px", "depth_m", "range_m")} == {""}
-    assert list(tmp_path.iterdir()) == [path]
 
 
-def test_zeros_have_no_sign(tmp_path):
-    path = tmp_path / "steps.csv"
-    with StepTable(path) as table:
-        table.write(dataclasses.replace(step(), commanded=(-0.0, np.float64(-0.0), 4800.0), t=-0.0))
-    with path.open(newline="") as file:
-        row = next(csv.DictReader(file))
-    assert [row[name] for name in ("t_s", "pan_commanded_deg", "tilt_commanded_deg")] == ["0.0"] * 3
-
-
-def fill_and_fail(path):
-    with StepTable(path) as table:
-        table.write(step())
-        raise KeyboardInterrupt
-
-
-def test_a_run_that_fails_leaves_the_old_table_and_no_rubbish(tmp_path):
-    path = tmp_path / "steps.csv"
-    path.write_text("old")
-    with pytest.raises(KeyboardInterrupt):
-        fill_and_fail(path)
-    with full_disk(), pytest.raises(ConfigError, match=SAID), StepTable(path) as table:
-        table.write(step())
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_no_path_writes_nothing_and_one_in_no_folder_is_named_at_once(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with StepTable(None) as table:
-        table.write(step())
-    assert not list(tmp_path.iterdir())
-    with pytest.raises(ConfigError, match=r"steps\.csv"):
-        StepTable(tmp_path / "none" / "steps.csv")
+def test_zeros_have_no_sign():
+    row = step_row(dataclasses.replace(step(), commanded=(-0.0, np.float64(-0.0), 4800.0), t=-0.0))
+    assert [str(row[COLUMNS.index(name)]) for name in ("t_s", "pan_commanded_deg", "tilt_commanded_deg")] == ["0.0"] * 3
 
 
 @pytest.fixture
