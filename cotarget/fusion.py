@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 
 import numpy as np
 
@@ -89,7 +90,7 @@ class StateHistory:
 
 def _around(kept: "deque[tuple[float, ...]]", t: float) -> Array:
     """Return the at most `POINTS` states nearest to a time, as rows."""
-    after = bisect_right(kept, t, key=lambda state: state[0])
+    after = bisect_right(kept, t, key=itemgetter(0))
     first = min(max(after - POINTS // 2, 0), max(len(kept) - POINTS, 0))
     return np.array([kept[i] for i in range(first, min(first + POINTS, len(kept)))])
 

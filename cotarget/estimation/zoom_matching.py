@@ -422,8 +422,11 @@ class CloseupFinder:
 
     def fixed_view_at(self, t: float) -> FixedView | None:
         """Return the stored cut-out nearest to time t [s]; None if none is within `longest_apart_s`."""
-        near = min(self._fixed_views, key=lambda fixed_view: abs(fixed_view.t - t), default=None)
-        return None if near is None or abs(near.t - t) > self._settings.longest_apart_s else near
+        near, apart_s = None, self._settings.longest_apart_s
+        for fixed_view in reversed(self._fixed_views):  # the newest first
+            if abs(fixed_view.t - t) <= apart_s:
+                near, apart_s = fixed_view, abs(fixed_view.t - t)
+        return near
 
     def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
         """Find the target in a zoom frame.
