@@ -287,28 +287,6 @@ def test_a_fault_of_the_viewfinder_is_told_and_recovered_from(name):
     assert bench.buffer.waited_s < 2 * PERIOD
 
 
-def test_a_late_frame_that_is_shown_again_in_time_is_no_newer_for_that():
-    bench = Bench()
-    bench.run(0.5)
-    newest = bench.frames[-1]
-    bench.camera.take["preview"], bench.camera.frozen = 1.0, jpeg(SIZE, 33)
-    bench.run(1.5)
-    bench.camera.take.clear()
-    bench.run(0.5)
-    assert bench.frames[-1] is newest
-
-
-def test_frames_of_another_size_are_an_error_until_it_is_set_back():
-    bench = Bench()
-    bench.camera.preview_size = (40, 30)
-    bench.run(0.3)
-    with pytest.raises(DeviceError, match="40x30"):
-        bench.newest()
-    bench.camera.preview_size = SIZE
-    bench.run(0.3)
-    assert bench.frames[-1].image.shape == (24, 32, 3)
-
-
 # Exif with one entry: orientation 6, to be shown turned by a quarter.
 TIFF = bytes.fromhex("4d4d002a 00000008 0001 0112 0003 00000001 0006 0000 00000000")
 EXIF = b"\xff\xe1" + (2 + 6 + len(TIFF)).to_bytes(2, "big") + b"Exif\0\0" + TIFF
@@ -535,16 +513,6 @@ def test_one_thread_has_the_camera_and_commands_do_not_wait_for_its_next_frame()
         assert len(link.threads) == 1
         assert threading.get_ident() not in link.threads
     assert link.commands("capture") == [1, 0]
-
-
-def test_an_old_frame_is_not_the_newest():
-    """While the viewfinder is blind the last frame grows old; half a second later it is none."""
-    with opened() as (camera, link):
-        camera.read(timeout=DEADLINE_S)
-        link.fail["preview"] = [BUSY, ...]
-        wait_for(lambda: "[-110]" in unreadable(camera, None))
-        link.fail.clear()
-        assert camera.read(timeout=DEADLINE_S).t > link.clock.now() - DEADLINE_S
 
 
 def test_a_lens_in_trouble_is_told_until_it_is_sent_again(monkeypatch):

@@ -140,13 +140,6 @@ def test_a_picture_is_out_with_its_last_byte_and_dated_by_its_first():
     assert not reader.unfinished
 
 
-def test_pictures_of_one_piece_share_its_time():
-    reader = MultipartReader("myboundary")
-    both = part(A) + part(B) + part(C)[:100]
-    assert [p.t for p in reader.feed(both, 5.0)] == [5.0, 5.0]
-    assert [p.t for p in reader.feed(part(C)[100:], 6.0)] == [5.0]
-
-
 def test_real_pictures_of_all_encodings_come_out_whole():
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
