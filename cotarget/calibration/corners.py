@@ -397,7 +397,8 @@ def find_corners(image: Image, board: BoardConfig, *, thorough: bool = True) -> 
             if numbered is not None and _is_whole(level, numbered, board):
                 factor = np.array(grey.shape[::-1]) / level.shape[::-1]
                 start = numbered if level is grey else (numbered + 0.5) * factor - 0.5
-                return np.round(_refine(grey, start, board.corners), CORNER_DECIMALS)
+                half = max(SMALLEST_WINDOW_PX, round(WINDOW_SHARE * smallest_spacing(start, board.corners)))
+                return np.round(refined(grey, start, np.ones(len(start), dtype=bool), half), CORNER_DECIMALS)
     return None
 
 
@@ -484,12 +485,6 @@ def _is_whole(grey: Image, corners_px: Array, board: BoardConfig) -> bool:
     right = are_corners(grey, corners_px, grid, H, SMALL).reshape(rows, columns)
     lines = (*right.mean(axis=0), *right.mean(axis=1))
     return min(lines) > SMALLEST_RIGHT and not goes_on(grey, grid, right.ravel(), H)
-
-
-def _refine(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array:
-    """Move the corners to the saddle points of the image, (N, 2) [px]."""
-    half = max(SMALLEST_WINDOW_PX, round(WINDOW_SHARE * smallest_spacing(corners_px, corners)))
-    return refined(grey, corners_px, np.ones(len(corners_px), dtype=bool), half)
 
 
 def _sector_based(flags: int) -> "BoardFinder":

@@ -21,14 +21,10 @@ Count = Annotated[int, Ge(0)]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Corners of the board in one capture; see `Capture` for the other attributes.
-
-    Attributes:
-        corners_px: all inner corners, row by row from the board's first, (N, 2) [px]; nan for corners that are not
-            seen.
-    """
+    """Corners of the board in one capture; see `Capture` for the other attributes."""
 
     camera: CameraName
+    # all inner corners, row by row from the board's first, (N, 2) [px]; nan for corners that are not seen
     corners_px: Array
     board: int
     pan: float = 0.0
@@ -62,27 +58,16 @@ def unseen(count: int) -> Array:
 
 @dataclass(frozen=True)
 class Capture:
-    """One image of a calibration board with the state that the devices reported.
+    """One image of a calibration board with the state that the devices reported."""
 
-    Attributes:
-        image: image, (H, W, 3) BGR.
-        camera: camera that took it.
-        board: number of the board's placement; images with the same number show the board in the same place.
-        pan: reported pan [rad].
-        tilt: reported tilt [rad].
-        focal_px: nominal focal length of the zoom camera [px]; None for the fixed camera.
-        t: middle of the exposure on the rig's clock [s].
-        source: name of the image's file, or None.
-    """
-
-    image: Image
-    camera: CameraName
-    board: int
-    pan: float = 0.0
-    tilt: float = 0.0
-    focal_px: float | None = None
-    t: float = 0.0
-    source: str | None = None
+    image: Image  # image, (H, W, 3) BGR
+    camera: CameraName  # camera that took it
+    board: int  # number of the board's placement; images with the same number show the board in the same place
+    pan: float = 0.0  # reported pan [rad]
+    tilt: float = 0.0  # reported tilt [rad]
+    focal_px: float | None = None  # nominal focal length of the zoom camera [px]; None for the fixed camera
+    t: float = 0.0  # middle of the exposure on the rig's clock [s]
+    source: str | None = None  # name of the image's file, or None
 
     def view(self, corners_px: Array) -> View:
         """Make the view of the capture from the corners found in it, (N, 2) [px]."""
@@ -99,19 +84,14 @@ class Rejected:
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a calibration.
+    """Options of a calibration."""
 
-    Attributes:
-        method: "joint", one fit of everything; or "sequential", the paper's method, for comparison.
-        encoders: joint only: True to fit the encoders' scales and zeros too, with a prior near 1 and 0.
-        regularize: joint only: True to give undetermined directions a weak prior, so that the calibration goes on with
-            an uncertainty to match; False to refuse them.
-        folds: joint only: number of parts into which the placements are split for the held-out check; 0 for no check.
-    """
-
-    method: str = "joint"
-    encoders: bool = False
+    method: str = "joint"  # "joint", one fit of everything; or "sequential", the paper's method, for comparison
+    encoders: bool = False  # joint only: True to fit the encoders' scales and zeros too, with a prior near 1 and 0
+    # joint only: True to give undetermined directions a weak prior, so that the calibration goes on with an
+    # uncertainty to match; False to refuse them
     regularize: bool = False
+    # joint only: number of parts into which the placements are split for the held-out check; 0 for no check
     folds: int = 5
 
 
@@ -120,29 +100,18 @@ DEFAULT_OPTIONS = Options()
 
 @model
 class Residuals:
-    """Residuals of a calibration: root mean square distance per point, over all corners of all views used [px].
+    """Residuals of a calibration: root mean square distance per point, over all corners of all views used [px]."""
 
-    Attributes:
-        fixed_rms_px: rms of the fixed camera's views, each board pose free.
-        zoom_rms_px: rms of the zoom camera's views, each board pose free.
-        stereo_rms_px: rms of pairs at home over both cameras' points, one board pose per pair; None without pairs.
-        handeye_rms_px: rms of all zoom views through the head's kinematics; None without a head.
-        outliers: number of single corners left out of the last fit.
-        fixed_views: number of views of the fixed camera used.
-        zoom_views: number of views of the zoom camera used.
-        pairs: number of placements that both cameras see at home.
-        rejected: images and views that were not used.
-    """
-
-    fixed_rms_px: NotNegative
-    zoom_rms_px: NotNegative
+    fixed_rms_px: NotNegative  # rms of the fixed camera's views, each board pose free
+    zoom_rms_px: NotNegative  # rms of the zoom camera's views, each board pose free
+    # rms of pairs at home over both cameras' points, one board pose per pair; None without pairs
     stereo_rms_px: NotNegative | None
-    handeye_rms_px: NotNegative | None
-    fixed_views: Count
-    zoom_views: Count
-    pairs: Count
-    outliers: Count = 0
-    rejected: tuple[Rejected, ...] = ()
+    handeye_rms_px: NotNegative | None  # rms of all zoom views through the head's kinematics; None without a head
+    fixed_views: Count  # number of views of the fixed camera used
+    zoom_views: Count  # number of views of the zoom camera used
+    pairs: Count  # number of placements that both cameras see at home
+    outliers: Count = 0  # number of single corners left out of the last fit
+    rejected: tuple[Rejected, ...] = ()  # images and views that were not used
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,22 +157,16 @@ class HeldOut:
 
     The board's pose comes from the fixed camera's view alone, and the mean of its corners in the zoom image is
     predicted. That is what pointing at a target does.
-
-    Attributes:
-        views: number of zoom views predicted.
-        measured_px: rms distance between predicted and seen mean, scaled from each view's focal length to the shortest.
-        predicted_px: rms distance that the covariance, the jitter and the corners' noise let expect.
-        corners_rms_px: rms of single corners of the views kept out, with only the boards' poses fitted.
-        ratio: rms of the distances, each over its expected value; 1 for a consistent covariance.
-        widened: factor by which the standard deviations were widened, because the measured distance exceeds the
-            predicted one beyond chance; 1 where they agree.
     """
 
-    views: Count
+    views: Count  # number of zoom views predicted
+    # rms distance between predicted and seen mean, scaled from each view's focal length to the shortest
     measured_px: NotNegative
-    predicted_px: NotNegative
-    corners_rms_px: NotNegative
-    ratio: NotNegative
+    predicted_px: NotNegative  # rms distance that the covariance, the jitter and the corners' noise let expect
+    corners_rms_px: NotNegative  # rms of single corners of the views kept out, with only the boards' poses fitted
+    ratio: NotNegative  # rms of the distances, each over its expected value; 1 for a consistent covariance
+    # factor by which the standard deviations were widened, because the measured distance exceeds the predicted
+    # one beyond chance; 1 where they agree
     widened: Annotated[float, Ge(1)] = 1.0
 
 

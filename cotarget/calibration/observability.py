@@ -63,19 +63,12 @@ TAKES_PART = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """Verdict on what motions determine of a transform.
+    """Verdict on what motions determine of a transform."""
 
-    Attributes:
-        determined: True if no direction is undetermined.
-        text: the verdict in words, with what to add.
-        free: names of what is undetermined; empty where all is determined.
-        directions: undetermined directions (w, d) of the transform [rad] and [m], unit vectors, (k, 6).
-    """
-
-    determined: bool
-    text: str
-    free: tuple[str, ...]
-    directions: Array
+    determined: bool  # True if no direction is undetermined
+    text: str  # the verdict in words, with what to add
+    free: tuple[str, ...]  # names of what is undetermined; empty where all is determined
+    directions: Array  # undetermined directions (w, d) of the transform [rad] and [m], unit vectors, (k, 6)
 
 
 @dataclass(frozen=True, eq=False)
