@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, dataclass_transform
 
-from annotated_types import Ge, Gt, Interval
+from annotated_types import Ge, Gt
 
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose, pose_dict
@@ -211,17 +211,9 @@ def _required(cls: type[Any]) -> list[str]:
 
 # Messages
 
-KINDS = {int: "whole numbers", float: "numbers", str: "texts"}  # elements of lists
-WORDS = {
-    "bool_type": "true or false",
-    "finite_number": "a finite number",
-    "float_type": "a finite number",
-    "int_type": "a whole number",
-    "path_type": "a text",
-    "string_type": "a text",
-}
 NO_TABLE = ("dataclass_type", "dict_type", "mapping_type")
 UNKNOWN, MISSING = "unexpected_keyword_argument", "missing"
+RANGES = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
 
 def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str]) -> str:
@@ -230,8 +222,10 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
     kind, loc, value = error["type"], error["loc"], error["input"]
     if kind == "json_invalid":  # a text with half of a surrogate pair, or tables in tables without end
         return f"{where or 'the file'}: {error['msg']}"
-    if said := _no_alternative(cls, errors, loc, where):
-        return said
+    for end in range(len(loc)):  # below a union, pydantic's place goes on with the type that it tried
+        if _is_union(_hint_at(cls, loc[:end])):
+            tried = (each for each in errors if each["loc"][:end] == loc[:end])
+            return f"{_join(where, loc[:end])}: {'; '.join(dict.fromkeys(map(_words, tried)))}"
     outer, hint = _table_at(cls, loc[:-1]), None if kind == UNKNOWN else _hint_at(cls, loc)
     at, above = _join(where, loc), _join(where, loc[:-1])
     if kind == UNKNOWN:
@@ -244,8 +238,6 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
         here, listed = (above, loc[:-1]) if kind == MISSING else (at, loc)
         of_list = _hint_at(cls, listed)
         return f"{here}: has {len(value)} values where {len(typing.get_args(bare(of_list)))} are wanted{_form(of_list)}"
-    if kind == "tuple_type" and typing.get_args(bare(hint)):
-        return f"{at}: {value!r} is not a list of {_elements(hint)}{_form(hint)}"
     if kind in NO_TABLE:
         return f"{at}: {value!r} is not a table"
     if kind == "literal_error":
@@ -254,29 +246,14 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
         said = str(error["ctx"]["error"])
         is_table = dataclasses.is_dataclass(bare(hint)) or bare(hint) is RigidTransform
         return _join(at, (said,)) if is_table else f"{at}: {said}"
-    if kind in WORDS:
-        return f"{at}: {value!r} is not {WORDS[kind]}"
-    if said := _out_of_range(error, hint):
-        while at.endswith("]"):  # the range is the list's
-            at = at[: at.rindex("[")]
-        return f"{at}: {said}"
-    return f"{at}: {value!r}: {error['msg']}"
+    while kind in RANGES and at.endswith("]"):  # the range is the list's
+        at = at[: at.rindex("[")]
+    return f"{at}: {_words(error)}{_form(hint) if kind == 'tuple_type' else ''}"
 
 
-def _no_alternative(cls: type[Any], errors: list[Any], loc: tuple[str | int, ...], where: str) -> str:
-    """Say which types a value of a union is none of; empty for an error that no union is around.
-
-    pydantic's place of such an error goes on with the type that it tried, which no key of the table is.
-    """
-    for end in range(len(loc)):
-        if _is_union(_hint_at(cls, loc[:end])):
-            at, tried = _join(where, loc[:end]), [each for each in errors if each["loc"][:end] == loc[:end]]
-            of_value = [each for each in tried if len(each["loc"]) == end + 1]  # the others are of parts of it
-            value = f" {of_value[0]['input']!r}" if of_value else ""
-            if len(of_value) == len(tried) and all(each["type"] in WORDS for each in tried):
-                return f"{at}:{value} is not {' or '.join(dict.fromkeys(WORDS[each['type']] for each in tried))}"
-            return f"{at}:{value} fits none of its types: {'; '.join(dict.fromkeys(each['msg'] for each in tried))}"
-    return ""
+def _words(error: Any) -> str:
+    """Say what is wrong with a value in pydantic's words; a list is its array."""
+    return str(error["msg"]).replace("Input", repr(error["input"]), 1).replace("valid array", "list")
 
 
 def _is_union(hint: Any) -> bool:
@@ -285,22 +262,6 @@ def _is_union(hint: Any) -> bool:
         hint = typing.get_args(hint)[0]
     kinds = [each for each in typing.get_args(hint) if each is not types.NoneType]
     return typing.get_origin(hint) in (types.UnionType, typing.Union) and len(kinds) > 1
-
-
-def _out_of_range(error: Any, hint: Any) -> str:
-    """Say how a number is out of its range; empty for any other error."""
-    value, ctx = error["input"], error.get("ctx", {})
-    within = next((each for each in _metadata(hint) if isinstance(each, Interval)), None)
-    match error["type"]:
-        case "greater_than_equal" | "less_than_equal" if within is not None:
-            return f"{value:g} is not within {within.ge:g} to {within.le:g}"
-        case "greater_than":
-            return f"{value:g} is not greater than {format(ctx['gt'], 'g') if ctx['gt'] else 'zero'}"
-        case "greater_than_equal":
-            return f"{value:g} is less than {ctx['ge']:g}" if ctx["ge"] else f"{value:g} is negative"
-        case "less_than_equal":
-            return f"{value:g} is more than {ctx['le']:g}"
-    return ""
 
 
 def _join(where: str, loc: Iterable[str | int]) -> str:
@@ -353,14 +314,6 @@ def form_of(hint: Any) -> str:
 def _form(hint: Any) -> str:
     """Write how a list must look, for the end of a message."""
     form, args = form_of(hint), typing.get_args(bare(hint))
-    if not form and args[-1] is ... and (one := form_of(args[0])):
+    if not form and args and args[-1] is ... and (one := form_of(args[0])):
         form = f"[{one}, ...]"
     return form and f", {form}"
-
-
-def _elements(hint: Any) -> str:
-    """Write how many elements of which kind a list must have."""
-    args = typing.get_args(bare(hint))
-    kinds = {bare(each) for each in args if each is not ...}
-    kind = KINDS.get(kinds.pop() if len(kinds) == 1 else float, "lists")
-    return kind if args[-1] is ... else f"{len(args)} {kind}"

@@ -569,7 +569,7 @@ def test_a_simulated_world_that_would_be_refused_by_now_can_still_be_replayed(co
     assert open_recording(copy).config.sim.zoom.center_px == (326.0, 239.0)
     config["sim"]["fixed"]["rate_hz"] = 0.0  # by which a replay goes
     edit("config", config)(copy)
-    with pytest.raises(ConfigError, match=r"sim\.fixed\.rate_hz: 0 is not greater than zero"):
+    with pytest.raises(ConfigError, match=r"sim\.fixed\.rate_hz: 0"):
         open_recording(copy)
 
 
