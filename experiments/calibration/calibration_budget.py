@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_views, predicted_pointing
@@ -24,7 +23,7 @@ from experiments.calibration.synthetic.aims import draw_targets, misses
 from experiments.calibration.synthetic.rig import LONGEST_PX, SIZES, Truth
 from experiments.calibration.synthetic.views import Boards, Looks, Placing, spread_views
 from experiments.engine import Count, Row, Settings
-from experiments.tables import grouped, outside, quartiles, rms
+from experiments.tables import grouped, outside, rms
 
 BOARD = BoardConfig()
 RIG = Truth()
@@ -119,28 +118,6 @@ def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Give each cell's error, and its ratio to the prediction."""
     cells = {cell: found["reached_px"] for cell, found in summary["cells"].items()}
     return {"reached_px": cells, "reached_over_predicted": summary["reached_over_predicted"]}
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """The error over the noise and over the placements: each seed's reached, and the predicted as lines."""
-    figure.set_size_inches(10, 4.5)
-    panels = (
-        ("noise_px", "placements", "noise of corners [px]"),
-        ("placements", "noise_px", "placements of the board"),
-    )
-    for ax, (x_key, of, label) in zip(figure.subplots(1, 2, sharey=True), panels, strict=True):
-        for i, value in enumerate(sorted({row[of] for row in rows})):
-            mine = [row for row in rows if row[of] == value]
-            name = f"{value:g} px" if of == "noise_px" else f"{value:g} placements"
-            xs = quartiles(ax, mine, x_key, "reached_px", color=f"C{i}", label=name)
-            predicted = [[row["predicted_px"] for row in mine if row[x_key] == x] for x in xs]
-            ax.plot(xs, np.median(predicted, axis=1), color=f"C{i}", lw=1)
-        ax.set(xscale="log", yscale="log", xlabel=label)
-        ax.set_xticks(xs, [f"{x:g}" for x in xs], minor=False)
-        ax.minorticks_off()
-        place = "upper left" if x_key == "noise_px" else "lower left"
-        ax.legend(loc=place, frameon=False, fontsize="small", title="points: reached, quartiles\nlines: predicted")
-    figure.axes[0].set_ylabel(f"rms pointing error [px at f = {LONGEST_PX:g} px]")
 
 
 SETTINGS = BudgetSettings()

@@ -22,7 +22,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge, Gt
-from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.camera import depth_from_size
@@ -32,14 +31,13 @@ from experiments.calibration.synthetic.aims import aim, looking_off
 from experiments.calibration.synthetic.rig import SIZE, Truth
 from experiments.engine import Count, Row, Settings
 from experiments.following.mounted import TARGET, at, cell_name, exact_calibration, mounted, off_px, wanted_focal_px
-from experiments.tables import grouped, quartiles, rms
+from experiments.tables import grouped, rms
 
 CAUSES = ("wrong size", "scatter", "pixels", "together")
 # Limits of Monte Carlo over first order, median over all. A size 10 % too large rotates by 1 / 1.1 of first order.
 AGREES = (0.88, 1.12)
 # Nearer, a bird at the image's edge, half outside, is where the lens model gives no depth.
 NEAREST_M = 2.0
-SHOWN_BASELINE, SHOWN_DEPTH = 0.4, 10.0  # [m]
 
 
 @dataclass(frozen=True)
@@ -169,36 +167,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
         for cause, found in summary.items()
         if not low <= (median := found["over_first_order"]["median"]) <= high
     ]
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Errors over depth and over baseline: Monte Carlo with quartiles over the seeds, first order as lines."""
-    figure.set_size_inches(13, 4.8)
-    over_depth, over_baseline, width = figure.subplots(1, 3)
-    depth = _nearest(rows, "depth_m", SHOWN_DEPTH)
-    baseline = _nearest(rows, "baseline_m", SHOWN_BASELINE)
-    panels = (
-        (over_depth, "depth_m", "baseline_m", baseline, "reached_deg", "pointing error [degrees]"),
-        (over_baseline, "baseline_m", "depth_m", depth, "reached_deg", "pointing error [degrees]"),
-        (width, "depth_m", "baseline_m", baseline, "width", "median offset / width of the close-up"),
-    )
-    for ax, x_key, held, value, y_key, label in panels:
-        for i, cause in enumerate(CAUSES):
-            mine = [row for row in rows if row["cause"] == cause and row[held] == value]
-            xs = quartiles(ax, mine, x_key, y_key, color=f"C{i}", label=cause)
-            if y_key == "reached_deg":
-                first_order = [[row["first_order_deg"] for row in mine if row[x_key] == x] for x in xs]
-                ax.plot(xs, np.median(first_order, axis=1), color=f"C{i}", lw=1)
-        named = "baseline" if held == "baseline_m" else "depth"
-        ax.set(
-            xscale="log", yscale="log", xlabel=x_key.replace("_m", " [m]"), ylabel=label, title=f"{named} {value:g} m"
-        )
-    over_depth.legend(frameon=False, title="points: Monte Carlo\nlines: first order", fontsize="small")
-
-
-def _nearest(rows: Sequence[Row], key: str, wanted: float) -> float:
-    """Give the existing value that is nearest to the wanted one."""
-    return float(min({row[key] for row in rows}, key=lambda value: abs(value - wanted)))
 
 
 SETTINGS = DepthSettings()

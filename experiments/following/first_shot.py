@@ -17,15 +17,13 @@ from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Gt, Le
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from cotarget.sim.targets.random_paths import SECONDS
 from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated, target_of
 from experiments.following.field_scenes import LATENCY_S, hold_config
 from experiments.following.shots import BEGIN_S, CAUSES, Fired, fire
-from experiments.tables import BESIDE, grouped, outside, rms, spread
+from experiments.tables import grouped, outside, rms, spread
 
 # Goals for each target: least and largest value.
 WANTED: Mapping[str, tuple[float, float]] = {
@@ -124,34 +122,6 @@ def _of(mean: Callable[[Sequence[float]], Any], values: Sequence[float]) -> floa
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List the figures that miss their goal."""
     return [text for name, figures in summary.items() for text in outside(figures, WANTED, name)]
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Offsets of first shots and corrected ones, each seed's first shots thin; the budgets, least to largest seed."""
-    left, right = figure.subplots(1, 2)
-    shown = (*CAUSES, "sum", "measured")
-    for i, (name, figures) in enumerate(summarise(rows).items()):
-        mine, how = [row for row in rows if row["target"] == name and row["fired"]], {"color": f"C{i}"}
-        for of_seed in grouped(mine, "seed").values():
-            _draw(left, of_seed, "tpo_width", lw=0.4, alpha=0.6, **how)
-        _draw(left, mine, "tpo_width", label=name, **how)
-        _draw(left, mine, "corrected_width", ls="--", label=f"{name}, corrected", **how)
-        middle = [figures[key] for key in shown]
-        low, high = ([figures[SEEDS][key][which] for key in shown] for which in ("least", "largest"))
-        right.errorbar(
-            np.arange(len(shown)) + BESIDE * i, middle, yerr=np.abs(np.subtract([low, high], middle)), fmt="o", **how
-        )
-    right.set_xticks(range(len(shown)), shown)
-    left.set(xlabel="offset / width", ylabel="part of the shots", xlim=(0, 0.65))
-    right.set(yscale="log", ylabel="rms / width")
-    right.tick_params(axis="x", labelrotation=60)
-    left.legend(frameon=False)
-
-
-def _draw(ax: Axes, shots: Sequence[Row], key: str, **how: Any) -> None:
-    """Plot the cumulative distribution of the shots' offsets."""
-    offsets = np.sort([row[key] for row in shots if row[key] is not None])
-    ax.plot(offsets, (np.arange(len(offsets)) + 1) / len(shots), **how)
 
 
 SETTINGS = FirstShotSettings()

@@ -348,7 +348,6 @@ def test_a_budget_is_summed_in_quadrature_over_shots_at_the_target():
     assert names(first_shot.missed({"book": figures})) == ["book: in_frame"]
     unexplained = [row(True, 0.1, delay=0.05)]
     assert names(first_shot.missed(first_shot.summarise(unexplained))) == ["book: tpo_width", "book: sum over measured"]
-    first_shot.plot(rows, Figure())
 
 
 # ---------------------------------------------------------------- hold
