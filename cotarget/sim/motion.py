@@ -58,7 +58,7 @@ def trapezoid(t: float, x: float, v: float, goal: float, speed: float, accelerat
 
 
 @dataclass(slots=True)
-class Plan:
+class PlannedMotion:
     """Motion from one command on, up to the start of the next plan.
 
     Attributes:
@@ -71,7 +71,7 @@ class Plan:
     t: float
     segments: list[Segment]
     driven: float
-    before: "Plan | None"
+    before: "PlannedMotion | None"
 
 
 class Axis:
@@ -96,7 +96,7 @@ class Axis:
         """
         self.speed, self.acceleration = speed, acceleration
         self._half = backlash / 2
-        self._newest = Plan(-math.inf, [(-math.inf, position, 0.0, 0.0)], position, None)
+        self._newest = PlannedMotion(-math.inf, [(-math.inf, position, 0.0, 0.0)], position, None)
         self._kept = deque([self._newest])  # oldest first; readers follow the links in place of it
 
     def command(self, t: float, goal: float, speed: float | None = None) -> float:
@@ -108,7 +108,7 @@ class Axis:
         while kept[-1].t >= t:
             kept.pop()
         before = kept[-1]
-        self._newest = Plan(t, segments, self._driven(before, t, segments[0][1]), before)
+        self._newest = PlannedMotion(t, segments, self._driven(before, t, segments[0][1]), before)
         kept.append(self._newest)
         while kept[1].t <= t - HISTORY_S:
             kept.popleft()
@@ -140,7 +140,7 @@ class Axis:
         x = _at(plan.segments, t)[0]
         return self._driven(plan, t, x)
 
-    def _plan(self, t: float) -> Plan:
+    def _plan(self, t: float) -> PlannedMotion:
         """Find the plan that moves the axis at time t [s]."""
         plan = self._newest
         while plan.t > t:
@@ -149,7 +149,7 @@ class Axis:
             plan = plan.before
         return plan
 
-    def _driven(self, plan: Plan, t: float, x: float) -> float:
+    def _driven(self, plan: PlannedMotion, t: float, x: float) -> float:
         """Follow the driven side through a plan to time t [s], where the motor is at ``x``."""
         half, segments, y = self._half, plan.segments, plan.driven
         if not half:
