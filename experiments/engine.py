@@ -258,16 +258,16 @@ def keep(case: Case, number: int, done: Done) -> None:
     if not (case.folder / "settings.json").exists():
         write_atomically(case.folder / "settings.json", identity(case))
     error, log = case.folder / f"{number:06d}.txt", case.folder / "seeds.csv"
-    if done.failed:
-        write_atomically(error, done.traceback.encode())
-    else:
-        error.unlink(missing_ok=True)
-        for name, png in done.pictures.items():
-            write_atomically(case.folder / f"{name}.png", png)
-        write_atomically(rows_file(case, number), csv_of(done.rows))
     line = csv_of([{"seed": number} | {key: getattr(done, key) for key in LOGGED}])
     with log.open("ab") as file:  # in one write, so that a killed run leaves no part of a line
         file.write(line if file.tell() == 0 else line.partition(b"\r\n")[2])
+    if done.failed:
+        write_atomically(error, done.traceback.encode())
+        return
+    error.unlink(missing_ok=True)
+    for name, png in done.pictures.items():
+        write_atomically(case.folder / f"{name}.png", png)
+    write_atomically(rows_file(case, number), csv_of(done.rows))  # last: a seed that has rows is in the log
 
 
 def forget(case: Case) -> None:
