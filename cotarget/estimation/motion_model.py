@@ -87,9 +87,8 @@ class FilterSettings:
             long enough for a moment behind a post; a target that fills the view has mostly stopped [s].
         jump_gate: beyond this NIS, ten standard deviations, a centre is wrong or the target is elsewhere.
         misses: rejected measurements in a row after which they are believed.
-        zoom_misses: rejected zoom measurements in a row, while the fixed camera is consistent, after which size and
+        zoom_misses: rejected zoom measurements in a row, while the fixed camera's are accepted, after which size and
             head bias are inflated.
-        consistent_nis: mean NIS below which the fixed camera counts as consistent.
         inflation: standard deviation added to the logarithms of depth, size and attitude that measurements contradict.
         bias_inflation: standard deviation added to the head's bias that the zoom camera contradicts [rad].
         nis_gain: weight of the newest measurement in the mean NIS, which scales the variance of the acceleration.
@@ -106,7 +105,6 @@ class FilterSettings:
     jump_gate: float = 100.0
     misses: int = 3
     zoom_misses: int = 8
-    consistent_nis: float = 2.0
     inflation: float = 0.3
     bias_inflation: float = 5e-3
     nis_gain: float = 0.2

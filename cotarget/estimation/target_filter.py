@@ -195,8 +195,7 @@ def correct_zoom(node: Node, observed: ZoomObservation, settings: FilterSettings
             nis = float(innovation @ S_inv @ innovation)
         if d[2] <= 0 or nis > GATE:
             # Where the fixed image contradicts the state too, the target has moved, and neither size nor head is wrong.
-            is_consistent = node.rejected_fixed == 0 and node.mean_nis < settings.consistent_nis
-            return replace(node, rejected_zoom=node.rejected_zoom + is_consistent)
+            return replace(node, rejected_zoom=node.rejected_zoom + (node.rejected_fixed == 0))
         gain = PHt @ S_inv
         x = node.x + gain @ innovation
     mean_nis = _mean_nis(node, nis, settings)
