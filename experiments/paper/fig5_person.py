@@ -31,19 +31,18 @@ from experiments.tables import grouped, outside, spread
 
 NAME = "person"
 MOMENTS, FIRST_S = 3, 4.4  # moments in the picture; time of the first [s], after the person's entry at 3 s
-FIGURES = {  # figures of a run, with descriptions
-    "tpe_px_median": "detection's error in the fixed view, px",
-    "tpo_px_median": "target point offset in the close-up, px",
-    "tpo_percent_median": "target point offset in the close-up, % of width",
-    "size_ratio_median": "size / wanted size",
-    "in_frame_ratio": "in frame, after acquisition",
-    "time_to_acquire_s": "time to acquire, s",
-    "closeup_yield": "close-up yield, acquisition included",
-    "identification": "marker decoded in the close-up",
-    "identification_wide": "marker decoded in the fixed view",
-    "false_tracks_per_min": "false tracks a minute",
-}
-SHOWN = ("tpe_px_median", "tpo_percent_median", "size_ratio_median", "closeup_yield")
+FIGURES = (
+    "tpe_px_median",
+    "tpo_px_median",
+    "tpo_percent_median",
+    "size_ratio_median",
+    "in_frame_ratio",
+    "time_to_acquire_s",
+    "closeup_yield",
+    "identification",
+    "identification_wide",
+    "false_tracks_per_min",
+)
 WANTED: Mapping[str, tuple[float, float]] = {
     "tpo_percent_median": (0.0, 4.0),
     "size_ratio_median": (0.85, 1.15),

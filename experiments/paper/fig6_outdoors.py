@@ -54,7 +54,6 @@ FIGURES = {  # figures of a run, with descriptions
     "too_early": "handovers while the one before is still there",
     "off_target_s": "followed is a track on nobody, s",
 }
-SHOWN = ("followed", "tpo_percent", "size_ratio", "in_frame", "handover_s", "off_target_s")
 # Goals for the median over the seeds. For early handovers the largest counts: where two persons cross, a track may
 # switch from one to the other, once a run.
 WANTED: Mapping[str, tuple[str, float, float]] = {
