@@ -475,6 +475,22 @@ def share_beyond(residuals: Array, sigma: float, times: float = 3.0) -> float:
     return float(np.mean(np.abs(residuals) > times * sigma)) if residuals.size else 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """Figures of a calibration, on which its verdict, its advice and its page are based."""
+
+    at: tuple[AtFocal, ...]  # `pointing` at the zoom samples
+    between: tuple[AtFocal, ...]  # `pointing` between them
+    parts: dict[str, float]  # `contributions`
+    evidence: Evidence | None  # from the stored corners
+
+
+def analyse(calibration: Calibration) -> Analysis:
+    """Compute the figures of a calibration."""
+    between = pointing(calibration, between_stops(calibration))
+    return Analysis(pointing(calibration), between, contributions(calibration), gather(calibration))
+
+
 def head_poses(views: Sequence[View]) -> Array:
     """List pan and tilt of the zoom views, (n, 2) [rad]."""
     return np.array([(view.pan, view.tilt) for view in views if view.camera == "zoom"]).reshape(-1, 2)

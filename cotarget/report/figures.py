@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +21,7 @@ from cotarget.geometry import Array
 from cotarget.report.analysis import (
     DEPTHS,
     TITLES,
+    Analysis,
     AtFocal,
     Corners,
     Evidence,
@@ -384,47 +385,40 @@ FIGURE_NAMES = (
     "situation",
     "lens",
 )
-Add = Callable[[str, Figure, str, str], None]  # name, figure, alt, caption
+Drawn = tuple[str, Figure, str, str]  # name, figure, alt, caption
 # Figures with many marks are embedded as PNG, with this resolution [dots per inch], so that the page stays small.
 DENSE = {"pointing_map": PNG_DPI, "residuals": 140, "coverage": PNG_DPI}
 
 
-def draw(
-    calibration: Calibration, at: tuple[AtFocal, ...], between: tuple[AtFocal, ...], evidence: Evidence | None
-) -> dict[str, Plot]:
+def draw(calibration: Calibration, found: Analysis) -> dict[str, Plot]:
     """Draw all figures for which the calibration has data, by the names of `FIGURE_NAMES`."""
     made: dict[str, Plot] = {}
-
-    def add(name: str, figure: Figure, alt: str, caption: str) -> None:
-        dense = name in DENSE
+    for name, figure, alt, caption in _drawn(calibration, found):
         png = as_bytes(figure, "png", DENSE.get(name, PNG_DPI))
-        made[name] = Plot(name, png, None if dense else as_bytes(figure, "svg"), alt, caption)
+        made[name] = Plot(name, png, None if name in DENSE else as_bytes(figure, "svg"), alt, caption)
+    return made
 
-    if at and np.isfinite(at[-1].rms):
-        _pointing(calibration, at, between, evidence, add)
-    if evidence is not None:
-        _corners(calibration, evidence, add)
+
+def _drawn(calibration: Calibration, found: Analysis) -> Iterator[Drawn]:
+    """Draw the figures one after the other."""
+    if found.at and np.isfinite(found.at[-1].rms):
+        yield from _pointing(calibration, found)
+    if found.evidence is not None:
+        yield from _corners(calibration, found.evidence)
     if len(calibration.zoom_head.lens.stops) > 1:
         bands = "" if calibration.covariance is None else " The bands are one standard deviation."
-        add(
+        yield (
             "lens",
             lens_figure(lens_curves(calibration)),
             "Curves of focal length ratio, principal point, distortion and entrance pupil over focal length",
             f"What the zoom lens does over its range; the dots are the zoom samples, and splines join them."
             f"{bands} κ₁ = k1 (n₀/n)² is the distortion as it appears in the image. The entrance pupil moves forward.",
         )
-    return made
 
 
-def _pointing(
-    calibration: Calibration,
-    at: tuple[AtFocal, ...],
-    between: tuple[AtFocal, ...],
-    evidence: Evidence | None,
-    add: Add,
-) -> None:
-    last = at[-1]
-    add(
+def _pointing(calibration: Calibration, found: Analysis) -> Iterator[Drawn]:
+    last = found.at[-1]
+    yield (
         "pointing_map",
         map_figure(calibration, last),
         "Heat maps of the predicted pointing error over the fixed image at three depths; "
@@ -432,25 +426,25 @@ def _pointing(
         "The fixed image with targets at three depths; lines join places of equal error, written in degrees. The error "
         "grows where no board reached, and with distance where boards were near only.",
     )
-    add(
+    yield (
         "pointing_depth",
-        depth_figure(calibration, last, None if evidence is None else evidence.distances),
+        depth_figure(calibration, last, None if found.evidence is None else found.evidence.distances),
         "Curves of the predicted pointing error over depth, for the middle and the worst corner of the fixed image",
         "Over depth, for a target in the middle of the fixed image and in the worst of its four corners. The marks on "
         "the axis are the boards of the calibration.",
     )
-    if len(at) > 1:
-        add(
+    if len(found.at) > 1:
+        yield (
             "pointing_focal",
-            focal_figure(at, between),
+            focal_figure(found.at, found.between),
             "Curves of the predicted pointing error over the focal length, in degrees and in pixels of the zoom image",
             "Over focal length, rms over the fixed image and the depths; the dots are the zoom samples. Between "
             "them the lens is interpolated, and what that leaves in doubt is counted.",
         )
 
 
-def _corners(calibration: Calibration, evidence: Evidence, add: Add) -> None:
-    add(
+def _corners(calibration: Calibration, evidence: Evidence) -> Iterator[Drawn]:
+    yield (
         "residuals",
         residual_figure(evidence),
         "Images of both cameras with the residual of every corner as an arrow, and the averages over small cells",
@@ -458,19 +452,19 @@ def _corners(calibration: Calibration, evidence: Evidence, add: Add) -> None:
         "Noise points everywhere. Right: averages over cells, magnified more; red ones are larger than chance makes "
         "them, and many of these in a row are what the model of the lens leaves out.",
     )
-    add(
+    yield (
         "histogram",
         histogram_figure(evidence),
         "Histograms of the residuals of both cameras against Gaussians",
         "Residuals against the Gaussian of their own standard deviation. Long tails are corners found wrongly.",
     )
-    add(
+    yield (
         "coverage",
         coverage_figure(evidence),
         "Where corners were seen in the images of both cameras",
         "Every corner that was used, over the number in each cell; no corner was seen in the pink cells.",
     )
-    add(
+    yield (
         "situation",
         situation_figure(
             evidence, calibration.zoom_head.lens.nominal_px, calibration.zoom_head.T_head_zoom is not None

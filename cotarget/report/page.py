@@ -18,14 +18,11 @@ from cotarget.report import figures
 from cotarget.report.analysis import (
     DEPTHS,
     TITLES,
-    AtFocal,
+    Analysis,
     Evidence,
+    analyse,
     averaged,
-    between_stops,
-    contributions,
     corner_errors,
-    gather,
-    pointing,
     share_beyond,
 )
 from cotarget.report.figures import Plot
@@ -89,12 +86,9 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
         CalibrationError: the stored corners do not determine the boards' poses.
         ConfigError: a file cannot be written.
     """
-    at = pointing(calibration)
-    between = pointing(calibration, between_stops(calibration))
-    evidence = gather(calibration)
-    found = judge(calibration, at, between, evidence)
-    parts = contributions(calibration)
-    made = figures.draw(calibration, at, between, evidence)
+    analysis = analyse(calibration)
+    found = judge(calibration, analysis)
+    made = figures.draw(calibration, analysis)
     used = calibration.residuals
     when, method = (calibration.provenance.get(key) for key in ("when", "method"))
     page = render(
@@ -107,16 +101,16 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
         calibration=calibration,
         figures=made,
         key_figures=key_figures(calibration),
-        pointing=_pointing(calibration, at, parts),
+        pointing=_pointing(calibration, analysis),
         tables=parameter_tables(calibration),
         two_columns=TWO_COLUMNS,
         correlations=correlations(calibration),
         strong=STRONG,
-        residuals=None if evidence is None else _residuals(evidence),
+        residuals=None if analysis.evidence is None else _residuals(analysis.evidence),
         too_careful=TOO_CAREFUL,
         rejected=[] if used is None else [(one.name, one.reason) for one in used.rejected],
         folded_from=FOLDED_FROM,
-        advice=advice(calibration, at, between, parts, evidence),
+        advice=advice(calibration, analysis),
     )
     _write(path, page, made)
     return found
@@ -141,8 +135,9 @@ def _write(path: Path, page: str, made: dict[str, Plot]) -> None:
         raise ConfigError(f"{where}: cannot be written: {error.strerror}") from None
 
 
-def _pointing(calibration: Calibration, at: tuple[AtFocal, ...], parts: dict[str, float]) -> dict[str, Any] | None:
+def _pointing(calibration: Calibration, found: Analysis) -> dict[str, Any] | None:
     """Compute what the page says of the predicted error; None where nothing can be predicted."""
+    at = found.at
     if not at or not np.isfinite(at[-1].rms):
         return None
     middle, corners = corner_errors(calibration, at[-1].nominal_px)
@@ -153,7 +148,7 @@ def _pointing(calibration: Calibration, at: tuple[AtFocal, ...], parts: dict[str
         "rms": total,
         "middle": middle,
         "worst": max(corners.values(), default=np.nan),
-        "gains": [(group, 1 - left / total) for group, left in parts.items() if total > 0],
+        "gains": [(group, 1 - left / total) for group, left in found.parts.items() if total > 0],
     }
 
 

@@ -21,18 +21,17 @@ from cotarget.report.analysis import (
     JITTER_GROUP,
     MORE_PLACEMENTS,
     TITLES,
+    Analysis,
     AtFocal,
     BoardShape,
     Evidence,
+    analyse,
     averaged,
-    between_stops,
     corner_errors,
     empty_places,
-    gather,
     head_poses,
     left_open,
     placements,
-    pointing,
     sigma_of,
     uncalibrated_px,
     what_stays,
@@ -59,16 +58,11 @@ FEWEST_SHARED = 5  # fewest placements seen by both cameras, so that some can be
 MANY_REJECTED, MANY_WRONG = 0.2, 0.01  # largest shares of rejected images and of wrong corners
 
 
-def advice(
-    calibration: Calibration,
-    at: tuple[AtFocal, ...],
-    between: tuple[AtFocal, ...],
-    parts: dict[str, float],
-    evidence: Evidence | None,
-) -> list[str]:
+def advice(calibration: Calibration, found: Analysis) -> list[str]:
     """Advise how to improve a calibration, roughly the most useful first; empty where nothing stands out."""
+    at, evidence = found.at, found.evidence
     items = [*_disagreement(calibration), *_missing(calibration), *_unconfirmed(calibration)]
-    items += [*_largest_part(at, parts), *_between_stops(at, between), *_worst_corner(calibration, at)]
+    items += [*_largest_part(at, found.parts), *_between_stops(at, found.between), *_worst_corner(calibration, at)]
     if evidence is not None:
         items += [*_images(calibration, evidence), *_patterns(evidence), *_situation(calibration, evidence)]
         items += _more_of_the_same(calibration, at)
@@ -545,13 +539,11 @@ class Verdict:
     level: Level
 
 
-def judge(
-    calibration: Calibration,
-    at: tuple[AtFocal, ...] | None = None,
-    between: tuple[AtFocal, ...] | None = None,
-    evidence: Evidence | None = None,
-) -> Verdict:
-    """Judge how well a calibration points."""
+def judge(calibration: Calibration, found: Analysis | None = None) -> Verdict:
+    """Judge how well a calibration points, and whether captures kept out of its fit agree.
+
+    None computes the analysis.
+    """
     if calibration.zoom_head.T_head_zoom is None:
         return Verdict(_without_head(calibration), "unknown")
     if calibration.covariance is None:
@@ -559,13 +551,12 @@ def judge(
     mismatch = _mismatch(calibration)
     if open_ := left_open(calibration):
         return Verdict(_sentence([*mismatch, f"does not determine the rig: {open_}"]), "bad")
-    evidence = gather(calibration) if evidence is None else evidence
+    found = analyse(calibration) if found is None else found
+    at, evidence = found.at, found.evidence
     if evidence is not None and _contradicts(calibration, evidence):
         return Verdict(
             "Does not explain the corners that are stored with it: they are not what it was made from.", "bad"
         )
-    at = pointing(calibration) if at is None else at
-    between = pointing(calibration, between_stops(calibration)) if between is None else between
     if not np.isfinite(at[-1].rms):
         return Verdict("Reaches no point of the fixed image with the head: its geometry cannot be right.", "bad")
     width = calibration.zoom_head.lens.size[0]
@@ -587,7 +578,7 @@ def judge(
         agreed.append("captures kept out of the fit agree")
     is_bad = at[-1].rms_px > OUT_OF_SIGHT * width
     level: Level = "bad" if is_bad else "care" if mismatch or doubts else "good"
-    return Verdict(_sentence([*mismatch, _how_well(at, between), *doubts, *agreed]), level)
+    return Verdict(_sentence([*mismatch, _how_well(at, found.between), *doubts, *agreed]), level)
 
 
 def _sentence(parts: list[str]) -> str:

@@ -17,9 +17,10 @@ from cotarget.cli.calibrating import calibration_summary
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.report.analysis import (
     JITTER_GROUP,
+    Analysis,
     Corners,
+    analyse,
     averaged,
-    contributions,
     empty_places,
     gather,
     given,
@@ -41,6 +42,7 @@ SECTIONS = ["figures", "pointing", "parameters", "residuals", "coverage", "lens"
 ZOOMED = 3.0  # the second stop's focal length over the first's
 LARGEST_PAGE = 3_000_000
 UNCHECKED = Options(folds=0)  # nothing is kept out, to be quick
+UNKNOWN = Analysis((), (), {}, None)
 ROUNDED = 0.06  # two digits are printed
 FAR_LENS = Lens(ZOOMED * 692.0, ZOOMED * 693.0, 328.0, 234.0)
 ZOOMING = Truth(stops=(Stop(ZOOMED * NOMINAL_PX, FAR_LENS, 0.01),))
@@ -157,7 +159,7 @@ def test_numbers_in_the_page_are_those_of_the_calibration(plain, tmp_path):
 @pytest.mark.slow
 def test_the_verdict_is_as_true_as_it_says(plain, stops):
     for calibration in (plain, stops):
-        said = float(re.match(r"Points to ([\d.]+) degrees", judge(calibration, between=()).text).group(1))
+        said = float(re.match(r"Points to ([\d.]+) degrees", judge(calibration).text).group(1))
         errors = pointing_errors(calibration, Truth(), np.random.default_rng(1), 30)
         # One calibration's error is one draw; over the view it is within a factor of three but once in hundreds.
         assert said / 3 < np.sqrt(np.mean(errors**2)) < said * 3
@@ -170,12 +172,13 @@ def test_the_verdict_is_as_true_as_it_says(plain, stops):
 
 
 def test_the_verdict_speaks_of_focal_lengths_between_the_stops(stops):
-    at = pointing(stops)
+    found = analyse(stops)
+    at = found.at
     worse = replace(at[0], focal_px=1000.0, rms=2 * max(one.rms for one in at))
     error = f"{digits(np.degrees(worse.rms))} degrees ({digits(worse.rms_px)} px)"
     said = f"and to {error} between its zoom samples, at 1000 px"
-    assert said in judge(stops, at, (worse,)).text
-    assert "between its zoom samples" not in judge(stops, at, ()).text
+    assert said in judge(stops, replace(found, between=(worse,))).text
+    assert "between its zoom samples" not in judge(stops, replace(found, between=())).text
 
 
 def without_covariance(method):
@@ -211,7 +214,7 @@ def test_a_wrong_model_leaves_nothing_undetermined(plain):
     assert "not determine" not in judge(wrong).text
     assert "not determine" in judge(replace(wrong, held_out=plain.held_out)).text
     assert "does not determine the rig" in judge(replace(wrong, covariance=wide.scaled({"T_head_zoom.rx": 1e6}))).text
-    words = advice(wrong, (), (), {}, None)
+    words = advice(wrong, UNKNOWN)
     assert words[0].startswith("Captures kept out miss 3000 times")
     assert not any("Add what is missing" in item for item in words)
 
@@ -278,7 +281,7 @@ def test_a_lens_that_zooms_further_than_was_calibrated_is_told(plain):
     longest = plain.zoom_head.lens.nominal_px[-1]
     for factor, told in ((1, False), (3, True)):
         changed = replace(plain, provenance={"focal_range_px": [667.0, factor * longest]})
-        said = advice(changed, (), (), {}, gather(changed))
+        said = advice(changed, replace(UNKNOWN, evidence=gather(changed)))
         assert any("but was calibrated to 667 px" in item for item in said) == told
 
 
@@ -294,7 +297,9 @@ def test_a_wavy_board_is_seen_and_said(plain):
     found = judge(calibration)
     assert found.level == "care"
     assert "not counting that the board's corners are 1." in found.text
-    assert any("mount it on something flat" in item for item in advice(calibration, (), (), {}, evidence))
+    assert any(
+        "mount it on something flat" in item for item in advice(calibration, replace(UNKNOWN, evidence=evidence))
+    )
     assert not gather(plain).shape.wrong
 
 
@@ -311,20 +316,24 @@ def test_a_pattern_in_the_residuals_and_a_bare_corner_are_seen():
 
 
 def test_advice_follows_from_the_figures(plain):
-    at, parts = pointing(plain), contributions(plain)
-    words = advice(plain, at, (), parts, gather(plain))
-    group, left = next(iter(parts.items()))
+    found = replace(analyse(plain), between=())
+    at, words = found.at, advice(plain, found)
+    group, left = next(iter(found.parts.items()))
     assert f"Were {group} known exactly" in words[0]
     assert f"the error would be {digits(np.degrees(left))} instead" in words[0]
     assert any("36 more would halve it" in item for item in words)  # a quarter of the variance takes 4 * 12
     still = replace(plain, views=tuple(replace(v, tilt=0.0) if v.camera == "zoom" else v for v in plain.views))
-    assert any("The head's tilt changed by 0 degrees" in item for item in advice(still, at, (), parts, gather(still)))
+    assert any(
+        "The head's tilt changed by 0 degrees" in item for item in advice(still, replace(found, evidence=gather(still)))
+    )
     much = replace(at[0], rms=10 * at[0].rms)
     shaky = replace(plain, jitter=np.radians(0.05))
-    words = advice(shaky, (much,), (), {JITTER_GROUP: at[0].rms}, None)
-    words += advice(shaky, pointing(shaky), (), {}, gather(shaky))
+    words = advice(shaky, Analysis((much,), (), {JITTER_GROUP: at[0].rms}, None))
+    words += advice(shaky, analyse(shaky))
     between = (replace(at[0], nominal_px=777.0, rms=4 * at[0].rms),)
-    assert any("at 777 px" in item and "Add a sample" in item for item in advice(plain, at, between, parts, None))
+    assert any(
+        "at 777 px" in item and "Add a sample" in item for item in advice(plain, replace(found, between=between))
+    )
     assert any("makes 99 % of the squared error" in item for item in words)
     assert any("play in the gears" in item for item in words)
     assert any("no number of them would halve it" in item for item in words)
@@ -346,7 +355,7 @@ def test_more_placements_take_nothing_from_the_jitter_nor_from_a_lens_between_it
     assert doubt > 0
     assert what_stays(stops, between) == pytest.approx(doubt, rel=0.01)
     said = f"from {digits(np.degrees(at.rms))} to {digits(np.degrees(with_more_placements(shaky, at)))} degrees"
-    assert any(said in item for item in advice(shaky, (at,), (), {}, gather(shaky)))
+    assert any(said in item for item in advice(shaky, analyse(shaky)))
     told = calibration_summary(shaky, Path("c.json"))
     assert told["predicted_error_deg_with_10_more_placements"] == {
         "667 px": pytest.approx(np.degrees(with_more_placements(shaky, at)))
