@@ -33,6 +33,7 @@ from tests.formats.lists import (
     CAPTURES_DEG,
     CAPTURES_FOCAL,
     CAPTURES_M,
+    COMMANDS,
     COMMANDS_DEG,
     COMMANDS_PX,
     CORNERS_PX,
@@ -281,7 +282,7 @@ def test_v010_recording_is_replayed(old, capsys):
         numbers = {key for key in b if key not in ("state", "reason", "track")}
         assert (a["state"], a["track"]) == (b["state"], b["track"])
         assert [float(a[key] or "nan") for key in numbers] == pytest.approx(
-            [float(b[key] or "nan") for key in numbers], abs=COMMANDS_PX, nan_ok=True
+            [float(b[key] or "nan") for key in numbers], rel=COMMANDS, abs=COMMANDS_PX, nan_ok=True
         )
 
 
