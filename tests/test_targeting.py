@@ -9,7 +9,7 @@ import pytest
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.errors import CalibrationError, ConfigError, CotargetError, UnreachableError
+from cotarget.errors import CalibrationError, ConfigError, UnreachableError
 from cotarget.geometry import RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import CameraSpec, HeadSpec, RigSpec, ZoomSpec
@@ -173,30 +173,18 @@ def test_the_shortcut_too_is_told_as_the_head_reports(method):
     assert around.pan == pytest.approx((true.pan + 2 * math.pi) / 1.01, rel=RELATIVE)
 
 
-def test_the_shortcut_says_where_it_has_no_solution():
-    """The depth in x_fixed is 1 m, but the point is 3 m below the zoom camera: |b| > r1."""
-    with pytest.raises(UnreachableError, match=r"shortcut has no solution.*use the exact method") as caught:
-        aim(shifted(0.0, 3.0, 5.0), np.array([0.0, 0.0, 1.0]), ANYWHERE, method="paper-table")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(("wanted_px", "nominal", "limited"), [
-    (10.0, 667.0, True),  # 10 x 10 / 0.234 = 427 px
-    (160.0, 160 * 10 / 0.234 * 667 / 686, False),  # the true focal length is 686 where the device says 667
-    (1000.0, 8000.0, True),
+@pytest.mark.parametrize(("how", "nominal", "limited"), [
+    ({}, 667.0, False),
+    ({"nominal_px": 1000.0}, 1000.0, False),
+    ({"nominal_px": 9000.0}, 8000.0, True),
+    ({"wanted_size": WantedSize(0.234, 10.0)}, 667.0, True),  # 10 x 10 / 0.234 = 427 px
+    # The true focal length is 686 where the device says 667.
+    ({"wanted_size": WantedSize(0.234, 160.0)}, 160 * 10 / 0.234 * 667 / 686, False),
+    ({"wanted_size": WantedSize(0.234, 1000.0)}, 8000.0, True),
 ])  # fmt: skip
-def test_the_focal_length_is_limited_to_the_lens(wanted_px, nominal, limited):
-    found = aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE, wanted_size=WantedSize(0.234, wanted_px))
-    assert found.nominal_px == pytest.approx(nominal, rel=RELATIVE)
-    assert found.limited is limited
-
-
-def test_without_a_closeup_the_lens_is_at_its_shortest_or_where_told():
-    x_fixed = np.array([0.0, 0.0, 10.0])
-    assert aim(HOME, x_fixed, ANYWHERE).nominal_px == 667.0
-    assert aim(HOME, x_fixed, ANYWHERE, nominal_px=1000.0).nominal_px == 1000.0
-    beyond = aim(HOME, x_fixed, ANYWHERE, nominal_px=9000.0)
-    assert (beyond.nominal_px, beyond.limited) == (8000.0, True)
+def test_the_focal_length_is_limited_to_the_lens(how, nominal, limited):
+    found = aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE, **how)
+    assert (found.nominal_px, found.limited) == (pytest.approx(nominal, rel=RELATIVE), limited)
 
 
 def test_positive_pan_is_right_and_positive_tilt_is_up():
@@ -236,25 +224,19 @@ LONG_LEVER = with_zoom_head(HOME, T_head_zoom=RigidTransform.from_translation([0
 FOLDING = replace(HOME, fixed=FixedCamera(replace(CENTRED, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))))
 
 
-@pytest.mark.parametrize(("act", "kind", "message"), [
-    (lambda: point_at(HOME, (320, 240), -1.0), CotargetError, "a depth of -1 m is not in front of the fixed camera"),
-    (lambda: point_at(HOME, (320, 240), 0.0), CotargetError, "a depth of 0 m is not in front"),
-    (lambda: point_at(HOME, (320, 240), math.nan), CotargetError, "a depth of nan m is not in front"),
-    (lambda: point_at(HOME, (320, 240), math.inf), CotargetError, "a depth of inf m is not in front"),
-    (lambda: point_at(HOME, (320, 240), depth_of(HOME, DEFAULT_TARGETS["book"], 0.0, (320, 240))),
-     CotargetError, "depth of nan"),
-    (lambda: point_at(HOME, (math.nan, 240), 5.0), CotargetError, r"pixel \(nan, 240\) lies outside"),
-    (lambda: point_at(FOLDING, (5000, 240), 5.0), CotargetError, r"pixel \(5000, 240\) lies outside"),
-    (lambda: aim(HOME, np.array([10.0, 0, 1]), replace(ANYWHERE, pan=(-1, 1))), UnreachableError,
-     r"pan 84\.29, tilt 0\.00 .*beyond the limits pan -57\.29.* to 57\.29"),
-    (lambda: aim(HOME, np.array([0, -10.0, 1]), replace(ANYWHERE, pan=(-1, 1), tilt=(-1, 1))), UnreachableError,
-     r"tilt 84\.29"),
-    (lambda: aim(LONG_LEVER, np.array([-0.2, 0.0, 0.0]), ANYWHERE), UnreachableError, "too close to the head"),
-    (lambda: aim(with_zoom_head(HOME, T_head_zoom=None), np.array([0, 0, 5.0]), ANYWHERE), CalibrationError,
-     "no T_head_zoom; calibrate on a rig"),
+@pytest.mark.parametrize(("act", "kind"), [
+    *((lambda z=z: point_at(HOME, (320, 240), z), UnreachableError) for z in (-1.0, 0.0, math.nan, math.inf)),
+    (lambda: point_at(HOME, (320, 240), depth_of(HOME, DEFAULT_TARGETS["book"], 0.0, (320, 240))), UnreachableError),
+    (lambda: point_at(HOME, (math.nan, 240), 5.0), UnreachableError),
+    (lambda: point_at(FOLDING, (5000, 240), 5.0), UnreachableError),
+    (lambda: aim(HOME, np.array([10.0, 0, 1]), replace(ANYWHERE, pan=(-1, 1))), UnreachableError),
+    (lambda: aim(HOME, np.array([0, -10.0, 1]), replace(ANYWHERE, pan=(-1, 1), tilt=(-1, 1))), UnreachableError),
+    (lambda: aim(LONG_LEVER, np.array([-0.2, 0.0, 0.0]), ANYWHERE), UnreachableError),
+    (lambda: aim(shifted(0.0, 3.0, 5.0), np.array([0, 0, 1.0]), ANYWHERE, method="paper-table"), UnreachableError),
+    (lambda: aim(with_zoom_head(HOME, T_head_zoom=None), np.array([0, 0, 5.0]), ANYWHERE), CalibrationError),
 ])  # fmt: skip
-def test_what_cannot_be_aimed_at_is_named_in_one_line(act, kind, message):
-    with pytest.raises(kind, match=message) as caught:
+def test_what_cannot_be_aimed_at_is_refused_in_one_line(act, kind):
+    with pytest.raises(kind) as caught:
         act()
     assert "\n" not in str(caught.value)
 
@@ -339,27 +321,24 @@ def spec(zoom_size=(640, 480), longest_px=8000.0):
 BOOK, PERSON, BIRD = (DEFAULT_TARGETS[name] for name in ("book", "person", "bird"))
 
 
-@pytest.mark.parametrize(("target", "name", "rig", "said"), [
-    (BOOK, "book", spec(), ""),
-    (PERSON, "person", spec(), ""),
-    (BIRD, "bird", spec(), ""),
-    (replace(BIRD, size=0.2), "bird2", spec(), ""),  # a sparrow
-    (replace(BOOK, size=23.4), "book", spec(), "targets.book.size: 23.4 m is far from the 0.234 m of a book;"),
-    (replace(BIRD, size=80.0), "bird2", spec(), "targets.bird2.size: 80 m is far from the 0.8 m of a bird;"),
-    (replace(BOOK, size=23.4), "house", spec(), ""),
-    (replace(BOOK, size=600.0), "dog", spec(), "targets.dog.size: 600 m is no size of a target; sizes are in metres"),
-    (replace(BOOK, size=600.0), "", spec(), "target.size: 600 m is no size of a target; sizes are in metres"),
-    (replace(BOOK, wanted_px=5000.0), "book", spec(),
-     "targets.book.wanted_px: 5000 px does not fit into the zoom camera's 640x480 image; give less than 640"),
-    (PERSON, "person", spec((320, 240)),
-     "targets.person.wanted_px: 300 px does not fit into the zoom camera's 320x240 image; give less than 240"),
-    (replace(BIRD, wanted_px=500.0), "bird", spec(), ""),  # along the width
+@pytest.mark.parametrize(("target", "name", "rig", "key"), [
+    (BOOK, "book", spec(), None),
+    (PERSON, "person", spec(), None),
+    (BIRD, "bird", spec(), None),
+    (replace(BIRD, size=0.2), "bird2", spec(), None),  # a sparrow
+    (replace(BOOK, size=23.4), "book", spec(), "targets.book.size"),
+    (replace(BIRD, size=80.0), "bird2", spec(), "targets.bird2.size"),
+    (replace(BOOK, size=23.4), "house", spec(), None),
+    (replace(BOOK, size=600.0), "dog", spec(), "targets.dog.size"),
+    (replace(BOOK, size=600.0), "", spec(), "target.size"),
+    (replace(BOOK, wanted_px=5000.0), "book", spec(), "targets.book.wanted_px"),
+    (PERSON, "person", spec((320, 240)), "targets.person.wanted_px"),
+    (replace(BIRD, wanted_px=500.0), "bird", spec(), None),  # along the width
     # 686 px show a target that fills the 640 px wide fixed image; 300 px show it 280 px wide.
-    (replace(BOOK, wanted_px=300.0), "book", spec(longest_px=667.0), ""),
-    (replace(BOOK, wanted_px=300.0), "book", spec(longest_px=300.0 * 667 / 686),
-     "targets.book.wanted_px: 300 px is more than the 280 px at which the longest focal length shows a target that"),
+    (replace(BOOK, wanted_px=300.0), "book", spec(longest_px=667.0), None),
+    (replace(BOOK, wanted_px=281.0), "book", spec(longest_px=300.0 * 667 / 686), "targets.book.wanted_px"),
+    (replace(BOOK, wanted_px=279.0), "book", spec(longest_px=300.0 * 667 / 686), None),
 ])  # fmt: skip
-def test_what_no_target_is_and_no_lens_shows_is_implausible(target, name, rig, said):
+def test_target_that_is_none_or_that_no_lens_shows_is_implausible(target, name, rig, key):
     found = target_implausibility(target, HOME, rig, name)
-    assert found.startswith(said)
-    assert bool(found) == bool(said)
+    assert found.startswith(f"{key}: ") if key else not found

@@ -11,7 +11,7 @@ from cotarget.detection import Detection
 from cotarget.estimation import TargetFilter, filter_settings
 from cotarget.pipeline import State, follow
 from experiments.calibration.synthetic.rig import SIZE, Truth
-from tests.pipeline.test_follow import CALIBRATION, PLAIN, Rig
+from tests.support.formula_rig import CALIBRATION, FIXED, FormulaRig
 from tests.support.moving_targets import calibration_of
 from tests.support.rigs import rig_of
 
@@ -51,7 +51,7 @@ class Approach:
         return Detection((low + high) / 2, high - low, 1.0, bool(cut.any()))
 
     def detect(self, frame):
-        return [self.box(PLAIN, frame.t)]
+        return [self.box(FIXED, frame.t)]
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.4, 3.0, 10.0])
@@ -136,7 +136,7 @@ SEEN = State.FOLLOWING, State.UNCONFIRMED  # the formula rig's zoom images show 
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [1.0, 1.4])
 def test_the_head_stands_before_a_person_who_has_come_close(speed):
-    way, rig = Approach("person", speed, waits_s=3.0), Rig()
+    way, rig = Approach("person", speed, waits_s=3.0), FormulaRig()
     poses = []
     for step in follow(rig_of(rig), CALIBRATION, way.target, way, seconds=25.0):
         poses.append((step.t, *rig.pose(rig.t)))

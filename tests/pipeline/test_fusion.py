@@ -12,7 +12,6 @@ import pytest
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.control.selection import RATE_S
 from cotarget.detection import Detection
 from cotarget.estimation.zoom_matching import CloseupFinder, MatchingSettings, ZoomMeasurement
 from cotarget.fusion import FusionSettings, TargetFusion
@@ -220,10 +219,10 @@ def test_candidates_have_directions_and_rates_as_the_head_sees_them():
     fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     t = seen(fusion, lambda t: [track(1, box_at(2.0 * t - 2.0, -1.0, 10.0), t)], 26)
     (found,) = fusion.candidates([track(1, box_at(0.0, -1.0, 10.0), t)], t)
-    now, later = (math.atan2(x - BASELINE, 10.0) for x in (0.0, 2.0 * RATE_S))
+    now, later = (math.atan2(x - BASELINE, 10.0) for x in (0.0, 2.0))
     assert found.at[0] == pytest.approx(now, abs=2e-3)
     assert found.at[1] == pytest.approx(math.atan2(1.0, math.hypot(BASELINE, 10.0)), rel=DEPTH)  # up
-    assert found.rate[0] == pytest.approx((later - now) / RATE_S, rel=SPEED)
+    assert found.rate[0] == pytest.approx(later - now, rel=SPEED)
 
 
 def test_only_confirmed_tracks_are_candidates_and_their_time_in_the_close_up_counts():

@@ -43,7 +43,7 @@ def test_tracks_of_an_external_detector_are_confirmed_alike_whatever_detector_th
     profile = DEFAULT_TARGETS[name]
     settings = tracking_settings(replace(profile, detector=detector), external=True)
     assert settings == tracking_settings(profile, external=True)
-    assert (settings.confirm_travel, settings.confirm_score, settings.doubt_score) == (0.0, 0.0, 0.0)
+    assert (settings.confirm_travel, settings.confirm_score) == (0.0, 0.0)
 
 
 def test_a_general_motion_lies_between_that_of_a_person_and_of_a_bird():

@@ -411,7 +411,7 @@ def collect(steps, into):
 
 
 @pytest.mark.parametrize("failing", [
-    dict.fromkeys([("fixed.read", n) for n in range(20, 200)], StaleFrameError("no frame within 1 s")),
+    dict.fromkeys([("fixed.read", n) for n in range(20, 1000)], StaleFrameError("no frame within 1 s")),
     {("head.move", 5): DeviceError("the head does not answer")},
     {("zoom.read", 9): OSError("input/output error")},
     {("head.move", 8): KeyboardInterrupt()},
