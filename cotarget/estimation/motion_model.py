@@ -28,8 +28,8 @@ from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.config import TargetProfile
 from cotarget.geometry import Array
 
-# Standard deviation of a reported angle of the head, by rounding and play [rad].
-HEAD_SIGMA = 5e-4
+# Standard deviation of a reported angle of the head: what rounding to steps of 0.05 degrees leaves [rad].
+HEAD_SIGMA = 3e-4
 # Least depth, in sizes of the target. Nearer, it spans more than a right angle, and pointing at it is no use.
 NEAREST_SIZES = 0.5
 # Gate on the normalised innovation squared (NIS), and bound of the search in the zoom image: three standard deviations.
@@ -62,7 +62,7 @@ class MotionSettings:
     attitude_mean: float = 0.0
     attitude_sigma: float = 0.02
     attitude_s: float = 1.0
-    bias_sigma: float = HEAD_SIGMA
+    bias_sigma: float = 5e-4
     bias_s: float = 60.0
     nearest: float = 0.1
 
@@ -78,10 +78,11 @@ class FilterSettings:
 
     Attributes:
         motion: motion of the target.
-        noise_px: standard deviation of a box's centre in the fixed image, the part independent of its size [px]. A
-            box's side errs by twice as much, because its centre is the mean of two edges and its side their distance.
+        noise_px: standard deviation of a box's centre in the fixed image, the part independent of its size [px].
         noise_of_size: the part proportional to the box's side, from moving limbs and wings.
         noise_s: how long an error of a centre lasts [s].
+        side_px: standard deviation of a box's side, the part independent of its size [px].
+        side_of_size: the part proportional to the side.
         size_s: how long an error of a side lasts, half a wing beat or step [s].
         unsized_s: time constant of the velocity along the axis while the fixed camera shows only a part of the target:
             long enough for a moment behind a post; a target that fills the view has mostly stopped [s].
@@ -100,6 +101,8 @@ class FilterSettings:
     noise_px: float = 0.4
     noise_of_size: float = 0.04
     noise_s: float = 0.03
+    side_px: float = 1.0
+    side_of_size: float = 0.05
     size_s: float = 0.2
     unsized_s: float = 0.5
     jump_gate: float = 100.0
@@ -121,11 +124,11 @@ MOTIONS = {
     "general": MotionSettings(2.5, 1.0, 3.0, 0.075, attitude_sigma=0.2),
 }
 # Measurement noise that differs from the defaults, by the target profile's `matcher`. The errors of an outline last
-# half a wing beat.
+# half a wing beat, those of its size a quarter of one.
 NOISE: Mapping[str, Mapping[str, Any]] = {
-    "box": {"noise_px": 0.2, "noise_of_size": 0.01, "noise_s": 0.0, "misses": 2},
+    "box": {"noise_px": 0.2, "noise_of_size": 0.01, "noise_s": 0.0, "side_px": 0.3, "side_of_size": 0.01, "misses": 2},
     "upright": {},
-    "outline": {"noise_of_size": 0.06, "noise_s": 0.1},
+    "outline": {"noise_of_size": 0.06, "noise_s": 0.1, "side_of_size": 0.1, "size_s": 0.06},
 }
 
 

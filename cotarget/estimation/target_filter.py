@@ -422,7 +422,7 @@ class TargetFilter:
         """Convert a size in the image [px], or a lower bound of it, to a size measurement."""
         if not size_px > 0:
             return None
-        sigma = 2 * math.hypot(self._settings.noise_of_size, self._settings.noise_px / size_px)
+        sigma = math.hypot(self._settings.side_of_size, self._settings.side_px / size_px)
         return SizeObservation(math.log(self._target.size / (size_px * abs(tangent_per_px))), sigma, bound)
 
     def _insert(self, observed: FixedObservation | ZoomObservation) -> bool:

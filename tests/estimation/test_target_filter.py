@@ -13,7 +13,7 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.errors import CalibrationError
 from cotarget.estimation import TargetFilter, filter_settings
-from cotarget.estimation.motion_model import HEAD_SIGMA, MOTIONS
+from cotarget.estimation.motion_model import MOTIONS
 from cotarget.geometry import RigidTransform
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import Reach, aim, depth_of, point_at
@@ -416,10 +416,10 @@ def test_two_frames_give_a_velocity_and_a_third_that_errs_alike_adds_little(afte
 
 def test_the_covariance_of_the_calibration_is_the_prior_of_the_heads_bias():
     calibration, person = calibration_of(Truth()), DEFAULT_TARGETS["person"]
-    assert filter_settings(person, calibration).motion.bias_sigma == HEAD_SIGMA
+    assert filter_settings(person, calibration).motion.bias_sigma == MOTIONS["walking"].bias_sigma
     doubtful = replace(calibration, covariance=Covariance(("zoom[0].cx",), np.array([[4.0]])))  # 2 px of 692
     sigma = filter_settings(person, doubtful).motion.bias_sigma
-    assert sigma == pytest.approx(math.hypot(HEAD_SIGMA, 2 / 692 / math.sqrt(2)), rel=0.02)
+    assert sigma == pytest.approx(math.hypot(MOTIONS["walking"].bias_sigma, 2 / 692 / math.sqrt(2)), rel=0.02)
     with pytest.raises(CalibrationError):
         TargetFilter(with_zoom_head(calibration, T_head_zoom=None), person)
 
