@@ -144,7 +144,6 @@ class Estimate:
     target: TargetProfile
     calibration: Calibration
     sight_lines: SightLines
-    carried: bool = False
 
     @property
     def x_fixed(self) -> Array:

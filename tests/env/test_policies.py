@@ -71,7 +71,7 @@ def test_the_reward_is_a_good_closeup_by_the_metrics(field, zoom, aside_px, rewa
 
 
 def test_rewards_are_those_of_the_exact_truth(field):
-    """Outlines are interpolated from tables; a close-up differs from the truth's only at the very bounds of a good one."""
+    """Outlines come from tables, so that a close-up differs from the truth only at the bounds of a good one."""
     env = Follow("bird", rig=field, seconds=4.0)
     policy, good = PipelinePolicy(env), 0
     observation, _ = env.reset(seed=1)
