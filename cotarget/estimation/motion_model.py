@@ -32,8 +32,11 @@ from cotarget.geometry import Array
 HEAD_SIGMA = 3e-4
 # Least depth, in sizes of the target. Nearer, it spans more than a right angle, and pointing at it is no use.
 NEAREST_SIZES = 0.5
-# Gate on the normalised innovation squared (NIS), and bound of the search in the zoom image: three standard deviations.
+# Bound of the search in the zoom image, and gate on the normalised innovation squared (NIS) of a size: three standard
+# deviations.
 GATE = 3.0**2
+# Gate on the NIS of a centre: 99.9 % of a chi-square with two degrees of freedom.
+CENTER_GATE = 13.8
 USUAL_DEPTH = 15.0  # initial depth of a target without a measured size [m]
 
 

@@ -20,6 +20,7 @@ from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.estimation.measurement_model import Estimate, SightLine, SightLines
 from cotarget.estimation.motion_model import (
+    CENTER_GATE,
     CL,
     GATE,
     HEAD_SIGMA,
@@ -166,8 +167,8 @@ def correct_fixed(node: Node, observed: FixedObservation, settings: FilterSettin
         if node.rejected_fixed + 1 < settings.misses:
             return replace(node, rejected_fixed=node.rejected_fixed + 1, rejected_zoom=0)
         return _correct_size(_restarted(node, observed, settings), observed.size, settings)
-    if nis > GATE:  # worse than its noise says: it counts as much as one at the gate
-        S_inv = _inverse(PHt[:2] + R * (nis / GATE))
+    if nis > CENTER_GATE:  # worse than its noise says: it counts as much as one at the gate
+        S_inv = _inverse(PHt[:2] + R * (nis / CENTER_GATE))
         nis = float(innovation @ S_inv @ innovation)
     gain = PHt @ S_inv
     node = replace(
@@ -193,7 +194,7 @@ def correct_zoom(node: Node, observed: ZoomObservation, settings: FilterSettings
         S_inv = _inverse(J @ PHt[SEEN] + observed.R)
         if i == 0:
             nis = float(innovation @ S_inv @ innovation)
-        if d[2] <= 0 or nis > GATE:
+        if d[2] <= 0 or nis > CENTER_GATE:
             # Where the fixed image contradicts the state too, the target has moved, and neither size nor head is wrong.
             return replace(node, rejected_zoom=node.rejected_zoom + (node.rejected_fixed == 0))
         gain = PHt @ S_inv
