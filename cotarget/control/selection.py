@@ -21,6 +21,8 @@ from cotarget.tracking.track import Track
 
 # Most targets whose orders are all searched, which takes some 3 ms; of more, those that leave first are taken.
 MOST_PLANNED = 7
+# Time over which a target's angular rate is computed [s].
+RATE_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,8 @@ class Candidate:
 
     @cached_property
     def rate(self) -> Array:
-        """Mean rates of pan and tilt over the next second, (2,) [rad/s]."""
-        return self.where(1.0) - self.at
+        """Rates of pan and tilt, (2,) [rad/s]."""
+        return (self.where(RATE_S) - self.at) / RATE_S
 
     def after(self, seconds: float) -> Angles:
         """Extrapolate pan and tilt a number of seconds from now [rad]."""
@@ -91,27 +93,27 @@ class SelectionState:
     settle_s: float
 
 
-class Order(NamedTuple):
-    """Order of targets: how many it serves, its end [s from now], and the id of its first target."""
+class Plan(NamedTuple):
+    """Best order: number of targets served, end of the order [s from now], and id of the first target."""
 
     served: int
     end: float
     first: int
 
 
-def plan(state: SelectionState) -> Order:
-    """Find the order that serves most targets before they leave, and of these the one that ends first.
+def plan(state: SelectionState) -> Plan:
+    """Plan the order that serves most targets before they leave, and of these the one that ends first.
 
-    If no target can be served, it begins with the one that would be done first. Of orders of the same targets with the
+    If no target can be served, the plan names the one that would be done first. Of orders of the same targets with the
     same last one, only the one that ends first is continued, because an earlier start from the same target never
     arrives later (dynamic programming after Held and Karp 1962).
     """
     planned = state.waiting[:MOST_PLANNED]
     alone = [(done_in(c, state, state.head, 0.0), c) for c in planned]
-    orders = {(1 << i, i): Order(1, end, c.id) for i, (end, c) in enumerate(alone) if end <= c.leaves_in}
+    orders = {(1 << i, i): Plan(1, end, c.id) for i, (end, c) in enumerate(alone) if end <= c.leaves_in}
     best = max(orders.values(), key=_worth, default=None)
     while orders:
-        longer: dict[tuple[int, int], Order] = {}
+        longer: dict[tuple[int, int], Plan] = {}
         for (done, last), order in orders.items():
             there = planned[last].after(order.end)
             for i, candidate in enumerate(planned):
@@ -120,18 +122,18 @@ def plan(state: SelectionState) -> Order:
                 end = done_in(candidate, state, there, order.end)
                 if end > candidate.leaves_in:  # it cannot be served
                     continue
-                key, found = (done | 1 << i, i), Order(order.served + 1, end, order.first)
+                key, found = (done | 1 << i, i), Plan(order.served + 1, end, order.first)
                 if key not in longer or _worth(found) > _worth(longer[key]):
                     longer[key] = found
         orders = longer
         best = max(orders.values(), key=_worth, default=best)
     if best is None:
         end, first = min(alone, key=lambda each: (each[0], each[1].id))
-        return Order(0, end, first.id)
+        return Plan(0, end, first.id)
     return best
 
 
-def _worth(order: Order) -> tuple[int, float, int]:
+def _worth(order: Plan) -> tuple[int, float, int]:
     """Sort key of orders, the best one largest."""
     return order.served, -order.end, -order.first
 

@@ -29,10 +29,8 @@ from cotarget.tracking.track import Track
 
 LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), math.radians(0.0514286))
 STILL = np.zeros(2)
-FRAME = 0.04
 LOOK_S, SETTLE_S = Rounds.look_s, Rounds.settle_s
 nearest_deadline, most_served = POLICIES["nearest-deadline"], POLICIES["most-served"]
-both_rounds = pytest.mark.parametrize("make", [nearest_deadline, most_served])
 
 
 def track(number, center=(320.0, 240.0), velocity=(0.0, 0.0), size=(20.0, 20.0), t=0.0):
@@ -40,141 +38,142 @@ def track(number, center=(320.0, 240.0), velocity=(0.0, 0.0), size=(20.0, 20.0),
     return Track(number, t, True, 0, center, velocity, size, float(size.max()), np.eye(4), 1.0, None)
 
 
-def candidate(number, pan=0.0, *, rate=0.0, leaves=math.inf, seen=0.0, reachable=True, likely=True, **where):
-    def at(later):
-        return np.array([pan + rate * later, 0.0])
-
-    return Candidate(track(number, **where), at, leaves, seen, reachable, likely)
+def candidate(number, pan=0.0, *, rate=0.0, leaves=math.inf, seen=0.0, **where):
+    return Candidate(track(number, **where), lambda later: np.array([pan + rate * later, 0.0]), leaves, seen)
 
 
-def select(selector, *candidates, head=STILL):
-    return selector.select(candidates, head, LIMITS)
-
-
-@pytest.mark.parametrize(("way_deg", "limits", "seconds"), [
+def test_a_way_takes_as_long_as_the_units_profile_says():
     # 206 degrees/s^2 reach 149 degrees/s after 0.7233 s and 53.89 degrees; with the braking, 107.77 degrees.
-    ((20.0, 5.0), LIMITS, 2 * math.sqrt(20 / 206)),
-    ((0.0, -140.0), LIMITS, 2 * 149 / 206 + (140 - 149**2 / 206) / 149),
-    ((0.0, 0.0), LIMITS, 0.0),
-    ((0.0, 149.0), replace(LIMITS, acceleration=math.inf), 1.0),
-    ((0.0, 149.0), replace(LIMITS, acceleration=math.inf, speed=math.inf), 0.0),
-])  # fmt: skip
-def test_travel_time_is_that_of_the_units_profile(way_deg, limits, seconds):
-    assert travel_s(np.radians(way_deg), limits) == pytest.approx(seconds)
+    assert travel_s(np.radians([20.0, 5.0]), LIMITS) == pytest.approx(2 * math.sqrt(20 / 206))
+    assert travel_s(np.radians([0.0, -140.0]), LIMITS) == pytest.approx(2 * 149 / 206 + (140 - 149**2 / 206) / 149)
+    assert travel_s(STILL, LIMITS) == 0.0
+    at_once = replace(LIMITS, acceleration=math.inf)
+    assert travel_s((0.0, at_once.speed), at_once) == pytest.approx(1.0)
+    assert travel_s(STILL, at_once) == travel_s(STILL, replace(at_once, speed=math.inf)) == 0.0
 
 
-@pytest.mark.parametrize(("center", "velocity", "seconds"), [
-    ((320, 240), (0, 0), math.inf),
-    ((320, 240), (100, 0), (639.5 - 320) / 100),
-    ((320, 240), (-100, 200), (479.5 - 240) / 200),
-    ((-5, 240), (-100, 0), 0.0),
-])  # fmt: skip
-def test_time_until_a_track_leaves_the_image(center, velocity, seconds):
-    assert leaves_in(track(1, center, velocity), (640, 480)) == pytest.approx(seconds)
+def test_when_a_track_leaves_the_image():
+    size = (640, 480)
+    assert leaves_in(track(1), size) == math.inf
+    assert leaves_in(track(1, velocity=(100, 0)), size) == pytest.approx((639.5 - 320) / 100)
+    assert leaves_in(track(1, velocity=(-100, 200)), size) == pytest.approx((479.5 - 240) / 200)
+    assert leaves_in(track(1, center=(-5, 240), velocity=(-100, 0)), size) == 0.0
 
 
 def test_first_come_stays_until_its_target_is_gone():
     selector = FirstCome()
-    assert select(selector) is None
-    assert select(selector, candidate(4), candidate(2)) == 2
-    assert select(selector, candidate(1), candidate(2, seen=60.0)) == 2
-    assert select(selector, candidate(3), candidate(4)) == 3
+    assert selector.select([], STILL, LIMITS) is None
+    assert selector.select([candidate(4), candidate(2)], STILL, LIMITS) == 2
+    assert selector.select([candidate(1), candidate(2, seen=60.0)], STILL, LIMITS) == 2
+    assert selector.select([candidate(3), candidate(4)], STILL, LIMITS) == 3
 
 
 @pytest.mark.parametrize("make", POLICIES.values(), ids=POLICIES)
-@pytest.mark.parametrize("fault", ["likely", "reachable"])
-def test_target_that_is_unlikely_or_out_of_reach_comes_last(make, fault):
-    selector, poor = make(), candidate(1, leaves=1.0, **{fault: False})
-    assert select(selector, poor) == 1  # a nominal size may be wrong, and the run must say what is out of reach
-    assert select(selector, poor, candidate(2)) == 2
-    assert select(make(), poor, candidate(2, **{fault: False})) is not None
-    assert selector.unmet == ""
-    assert not selector.favours(track(1))
+def test_what_is_unlikely_is_looked_at_only_where_nothing_else_is(make):
+    cloud = replace(candidate(1, leaves=1.0), likely=False)
+    selector = make()
+    assert selector.select([cloud], STILL, LIMITS) == 1
+    assert selector.select([cloud, candidate(2)], STILL, LIMITS) == 2
+    # Where size or calibration are wrong they all turn out to be; then nobody is left for that.
+    unlikely = replace(candidate(2), likely=False)
+    assert selector.select([cloud, unlikely], STILL, LIMITS) is not None
+    assert make().select([unlikely], STILL, LIMITS) == 2
 
 
-def test_nearest_deadline_comes_first_and_is_seen_to_its_end():
+def test_the_nearest_deadline_comes_first_and_is_seen_to_its_end():
     selector = nearest_deadline()
     there = [candidate(1, 0.2, leaves=9.0), candidate(2, -0.2, leaves=4.0), candidate(3, 0.1, leaves=6.0)]
-    assert select(selector, *there) == 2
+    assert selector.select(there, STILL, LIMITS) == 2
     sooner = [*there, candidate(4, leaves=3.0)]
-    assert select(selector, *sooner) == 2  # is being looked at
-    assert select(selector, candidate(2, seen=LOOK_S, leaves=3.0), *(c for c in sooner if c.id != 2)) == 4
+    assert selector.select(sooner, STILL, LIMITS) == 2  # is being looked at
+    seen = [candidate(2, seen=LOOK_S, leaves=3.0), *(c for c in sooner if c.id != 2)]
+    assert selector.select(seen, STILL, LIMITS) == 4
 
 
-def test_nearest_deadline_passes_over_what_it_cannot_reach_in_time():
+def test_the_nearest_deadline_does_not_run_after_what_it_cannot_have():
     lost, kept = candidate(1, 0.5, leaves=1.0), candidate(2, -0.5, leaves=9.0)
-    assert select(nearest_deadline(), lost, kept) == 2
-    assert select(nearest_deadline(), lost) == 1
+    assert nearest_deadline().select([lost, kept], STILL, LIMITS) == 2
+    assert nearest_deadline().select([lost], STILL, LIMITS) == 1
 
 
-@both_rounds
-def test_when_all_have_been_seen_the_one_seen_least_is_next(make):
-    assert select(make(), *(candidate(i, seen=seen) for i, seen in ((1, 5.0), (2, 2.0), (3, 3.0)))) == 2
-    assert select(make()) is None
+def test_when_all_have_been_seen_whoever_was_seen_least_is_next():
+    for selector in (nearest_deadline(), most_served()):
+        seen = [candidate(1, seen=5.0), candidate(2, seen=2.0), candidate(3, seen=3.0)]
+        assert selector.select(seen, STILL, LIMITS) == 2
+        assert selector.select([], STILL, LIMITS) is None
 
 
-def test_plan_gives_up_one_to_have_two():
-    """The far one on the left can be had, but the two on the right leave while the head comes back."""
+def test_the_plan_gives_up_one_to_have_two():
+    # A look takes 1.2 s and 0.6 s to settle. The first is far off on the left and leaves after 3.5 s: it can be had,
+    # but the two on the right leave while the head comes back.
     far = candidate(1, -2.4, leaves=3.5)
     right = [candidate(2, 0.2, leaves=4.2), candidate(3, 0.25, leaves=5.0)]
     one = travel_s(far.at, LIMITS) + SETTLE_S + LOOK_S
     assert one < 3.5
     assert one + travel_s(right[0].at - far.at, LIMITS) + SETTLE_S + LOOK_S > 5.0
-    assert select(nearest_deadline(), far, *right) == 1
-    assert select(most_served(), far, *right) in (2, 3)
+    assert nearest_deadline().select([far, *right], STILL, LIMITS) == 1
+    assert most_served().select([far, *right], STILL, LIMITS) in (2, 3)
 
 
-def test_plan_is_kept_while_the_times_to_leave_waver():
-    selector, rng, chosen = most_served(), np.random.default_rng(0), set()
+def test_a_plan_is_kept_while_the_times_to_leave_waver():
+    selector, rng = most_served(), np.random.default_rng(0)
+    chosen = set()
     for k in range(25):  # a second
-        leaves, t = rng.uniform(3.0, 9.0, 3), FRAME * k
-        there = (candidate(i, 0.2 * i, leaves=leaves[i], seen=t * (i in chosen), t=t) for i in range(3))
-        chosen.add(select(selector, *there))
+        leaves = rng.uniform(3.0, 9.0, 3)
+        there = [candidate(i, 0.2 * i, leaves=leaves[i], seen=0.04 * k * (i in chosen), t=0.04 * k) for i in range(3)]
+        chosen.add(selector.select(there, STILL, LIMITS))
     assert len(chosen) == 1
-    gone = (candidate(i, 0.2 * i, leaves=0.1 if i in chosen else 9.0, t=1.0) for i in range(3))
-    assert select(selector, *gone) not in chosen
+    gone = [candidate(i, 0.2 * i, leaves=0.1 if i in chosen else 9.0, t=1.0) for i in range(3)]
+    assert selector.select(gone, STILL, LIMITS) not in chosen
 
 
-@both_rounds
-def test_no_target_is_left_before_the_lens_has_settled(make):
-    """Two that leave in turn too soon: a new plan in every frame would go to and fro between them."""
-    selector, found, turned = make(), [], [0.0]
-    for k in range(100):
+@pytest.mark.parametrize("make", [nearest_deadline, most_served])
+def test_nobody_is_left_before_the_lens_has_settled(make):
+    """Two that leave in turn too soon: a plan anew at every frame would go to and fro between them."""
+    selector = make()
+    first = selector.select([candidate(1, 0.2, leaves=1.0), candidate(2, -0.2, leaves=9.0)], STILL, LIMITS)
+    turned = []
+    for k in range(1, 100):
         leaves = (9.0, 1.0) if k % 2 else (1.0, 9.0)
-        there = (candidate(i, 0.4 * i - 0.6, leaves=leaves[i - 1], t=FRAME * k) for i in (1, 2))
-        found.append(select(selector, *there))
-        turned += [FRAME * k] if k and found[-1] != found[-2] else []
-    assert all(np.diff(turned) >= SETTLE_S - 1e-9)
-    other = 3 - found[-1]
-    assert select(selector, candidate(other, t=4.0)) == other  # the one that is gone is not waited for
+        there = [candidate(i, 0.4 * i - 0.6, leaves=leaves[i - 1], t=0.04 * k) for i in (1, 2)]
+        found = selector.select(there, STILL, LIMITS)
+        if found != first:
+            turned.append(0.04 * k)
+            first = found
+    assert all(np.diff([0.0, *turned]) >= SETTLE_S - 1e-9)
+    assert selector.select([candidate(3 - first, t=4.0)], STILL, LIMITS) == 3 - first  # who is gone is not waited for
 
 
-@both_rounds
+@pytest.mark.parametrize("make", [nearest_deadline, most_served])
 @pytest.mark.parametrize("apart", [0.01, 0.1, 0.4])
-def test_targets_that_were_all_seen_are_looked_at_in_turn_and_for_long_enough(make, apart):
+def test_who_were_all_seen_are_looked_at_in_turn_and_for_long_enough(make, apart):
+    """Three who stay: each frame at one makes another the least seen, and the head would be under way all the time."""
     selector, pans, seen, head, goal, arrives, turned = make(), apart * np.arange(3), np.zeros(3), 0.0, None, 0.0, []
-    for t in np.arange(0, 20, FRAME):
-        there = (candidate(i, pans[i], seen=seen[i], t=t) for i in range(3))
-        found = select(selector, *there, head=np.array([head, 0.0]))
+    for t in np.arange(0, 20, 0.04):
+        there = [candidate(i, pans[i], seen=seen[i], t=t) for i in range(3)]
+        found = selector.select(there, np.array([head, 0.0]), LIMITS)
         if found != goal:
             arrives = t + travel_s((pans[found] - head, 0.0), LIMITS) + 0.3
             goal = found
             turned.append(t)
         if t >= arrives:
             head = pans[goal]
-            seen[goal] += FRAME
-    assert np.diff(turned).min() >= LOOK_S - 1.01 * FRAME
+            seen[goal] += 0.04
+    assert np.diff(turned).min() >= LOOK_S - 0.041
     assert seen.sum() > 20 / 2
-    assert np.ptp(seen) <= LOOK_S + 1.01 * FRAME
+    assert np.ptp(seen) <= LOOK_S + 0.041
 
 
-@both_rounds
-def test_target_hidden_from_the_zoom_camera_alone_does_not_keep_the_head(make):
-    selector, seen, hidden, turned = make(), np.full(2, 2.0), 0, []
-    for t in np.arange(0.0, 20, FRAME):
-        turned.append(select(selector, *(candidate(i, 0.1 * i, seen=seen[i], t=t) for i in range(2))))
-        seen[turned[-1]] += FRAME * (turned[-1] != hidden)
-    assert np.mean(turned) > 0.3  # the part of the time for which the other one is looked at
+@pytest.mark.parametrize("make", [nearest_deadline, most_served])
+def test_who_cannot_be_seen_any_more_does_not_keep_the_head(make):
+    """The zoom camera's view of it is blocked, and the wide one's is not."""
+    selector, seen, hidden = make(), np.full(2, 2.0), 0
+    turned = [selector.select([candidate(i, 0.1 * i, seen=seen[i], t=0.0) for i in range(2)], np.zeros(2), LIMITS)]
+    for t in np.arange(0.04, 20, 0.04):
+        there = [candidate(i, 0.1 * i, seen=seen[i], t=t) for i in range(2)]
+        turned.append(selector.select(there, np.zeros(2), LIMITS))
+        seen[turned[-1]] += 0.04 * (turned[-1] != hidden)
+    assert np.mean(turned) > 0.3  # of the time number 1 is looked at
 
 
 def served_by_best_order(candidates, head):
@@ -196,55 +195,68 @@ def served_by_best_order(candidates, head):
     return best
 
 
-def planned(candidates):
-    return plan(SelectionState(candidates, None, (0.0, 0.0), LIMITS, LOOK_S, SETTLE_S))
-
-
-def test_plan_is_the_best_of_all_orders():
-    rng, sharp = np.random.default_rng(3), 0
+def test_the_plan_is_the_best_of_all_orders():
+    rng = np.random.default_rng(3)
+    sharp = 0
     for _ in range(25):
         five = [
             candidate(i, rng.uniform(-1.5, 1.5), rate=rng.uniform(-0.1, 0.1), leaves=rng.uniform(2, 9))
             for i in range(5)
         ]
-        found, best = planned(five), served_by_best_order(five, STILL)
+        found = plan(SelectionState(five, None, (0.0, 0.0), LIMITS, LOOK_S, SETTLE_S))
+        best = served_by_best_order(five, STILL)
         assert abs(found.served - best) <= 1  # the way to a moving target is only nearly right
         sharp += found.served == best
-        assert select(most_served(), *five) == found.first
+        assert most_served().select(five, STILL, LIMITS) == found.first
     assert sharp >= 23
 
 
-def test_plan_of_many_takes_a_part_of_a_frame(monkeypatch):
+def test_a_plan_of_many_takes_a_part_of_a_frame(monkeypatch):
     """All can be had in any order, so that nothing is left out: ways are counted, as time depends on the machine."""
     ways = []
     monkeypatch.setattr(selection, "travel_s", lambda way, limits: ways.append(way) or travel_s(way, limits))
-    planned([candidate(i, 0.1 * i, leaves=1000.0) for i in range(MOST_PLANNED + 3)])
+    many = [candidate(i, 0.1 * i, leaves=1000.0) for i in range(MOST_PLANNED + 3)]
+    assert most_served().select(many, STILL, LIMITS) is not None
     n = MOST_PLANNED
     # Two ways for each step from a set of targets and the last of it to another target, and to each as the first.
     assert len(ways) <= 2 * (n + n * (n - 1) * 2 ** (n - 2)) < 3000  # of some microseconds each; orders there are 13699
 
 
-def test_plan_that_serves_no_target_begins_with_the_one_done_first():
-    found = planned([candidate(1, 0.5, leaves=0.1), candidate(2, -0.2, leaves=0.2)])
+def test_a_plan_with_nobody_to_be_had_takes_who_is_done_first():
+    lost = [candidate(1, 0.5, leaves=0.1), candidate(2, -0.2, leaves=0.2)]
+    found = plan(SelectionState(lost, None, (0.0, 0.0), LIMITS, LOOK_S, SETTLE_S))
     assert (found.served, found.first) == (0, 2)
 
 
-def simulated(selector, rng, seconds=20.0, targets=5):
+def simulated(selector, rng, seconds=20.0, targets=5, dt=0.04):
     """How many of five targets that cross the view were seen for a second: a head by its profile, no errors."""
     begins = rng.uniform(0, 8, targets)
     speeds = rng.uniform(0.08, 0.2, targets) * rng.choice([-1, 1], targets)
     starts = -np.sign(speeds) * 0.43
-    seen, head, arrives, goal = np.zeros(targets), np.zeros(2), 0.0, None
-    for t in np.arange(0, seconds, FRAME):
+    seen, good, head, arrives, goal = np.zeros(targets), 0.0, np.zeros(2), 0.0, None
+    for t in np.arange(0, seconds, dt):
         at = starts + speeds * (t - begins)
-        leaves = (0.43 - at * np.sign(speeds)) / np.abs(speeds)
-        there = np.flatnonzero((t >= begins) & (np.abs(at) < 0.43)).tolist()
-        known = (candidate(i, at[i], rate=speeds[i], leaves=leaves[i], seen=seen[i], t=t) for i in there)
-        if (chosen := select(selector, *known, head=head)) != goal and chosen is not None:
-            arrives = t + travel_s(np.array([at[chosen], 0.0]) - head, LIMITS) + 0.5
-        if (goal := chosen) is not None:
+        there = [i for i in range(targets) if t >= begins[i] and abs(at[i]) < 0.43]
+        known = [
+            candidate(
+                i,
+                at[i],
+                rate=speeds[i],
+                leaves=(0.43 - abs(at[i]) * np.sign(at[i] * speeds[i])) / abs(speeds[i]),
+                seen=seen[i],
+                t=t,
+            )
+            for i in there
+        ]
+        chosen = selector.select(known, head, LIMITS)
+        if chosen != goal:
+            goal = chosen
+            if goal is not None:
+                arrives = t + travel_s(np.array([at[goal], 0.0]) - head, LIMITS) + 0.5
+        if goal is not None:
+            good = t >= arrives
             head = np.array([at[goal], 0.0])
-            seen[goal] += FRAME * (t >= arrives)
+            seen[goal] += dt * good
     return int(np.sum(seen >= 1.0))
 
 
@@ -258,56 +270,48 @@ def test_planning_serves_most_of_targets_that_come_and_go():
     assert served["most-served"] >= 1.5 * served["first-come"]
 
 
-def clicked(pixel, width_px=640):
+def test_a_number_is_followed_and_nothing_else():
+    selector = Chosen(number=3)
+    assert selector.select([candidate(1), candidate(2)], STILL, LIMITS) is None
+    assert selector.select([candidate(1), candidate(3)], STILL, LIMITS) == 3
+    assert selector.select([candidate(1)], STILL, LIMITS) is None
+
+
+def clicked(pixel, width_px):
+    """A selector of what a click into an image of that width shows."""
     selector = Chosen(pixel=pixel)
     selector.start((width_px, 480))
     return selector
 
 
-def test_chosen_number_is_followed_in_reach_or_not_and_no_other():
-    selector = Chosen(number=3)
-    assert [selector.favours(track(n)) for n in (1, 3)] == [False, True]
-    for there, found in (((1, 2), None), ((1, 3), 3), ((1,), None)):
-        assert select(selector, *(candidate(n, reachable=n == 1) for n in there)) == found
-        assert selector.unmet == ("" if found else "track 3 is not there")
-
-
-@pytest.mark.parametrize(("pixel", "found"), [((131, 101), 2), ((80, 80), 1), ((160, 100), 2), ((400, 300), None)])
-def test_click_means_the_box_that_holds_it_or_the_nearest_one_near(pixel, found):
-    large, small = candidate(1, center=(100, 100), size=(80, 80)), candidate(2, center=(130, 100), size=(8, 8))
-    assert select(clicked(pixel), large, small) == found
-
-
-def test_clicked_target_keeps_its_number():
-    selector = clicked((100.0, 200.0), 500.0)  # 40 px are near
-    near, far = {"center": (100, 239)}, {"center": (100, 241)}
-    assert [selector.favours(track(1, **where)) for where in (near, far)] == [True, False]
-    assert select(selector, candidate(2, **far)) is None
-    assert selector.unmet == "no track at the click (100, 200)"
-    assert select(selector, candidate(1, **near)) == 1
-    assert selector.unmet == ""
-    assert [selector.favours(track(n, center=(100, 200))) for n in (1, 3)] == [True, False]
-    assert select(selector, candidate(1, center=(20, 20)), candidate(2, center=(100, 200))) == 1
-    assert select(selector) is None
-    assert selector.unmet == "track 1, which was at the click (100, 200), is not there any more"
+def test_a_click_means_the_box_it_is_in_or_the_nearest_one_near():
+    large = candidate(1, center=(100, 100), size=(80, 80))
+    small = candidate(2, center=(130, 100), size=(8, 8))
+    assert clicked((131, 101), 640).select([large, small], STILL, LIMITS) == 2
+    assert clicked((80, 80), 640).select([large, small], STILL, LIMITS) == 1
+    assert clicked((160, 100), 640).select([large, small], STILL, LIMITS) == 2
+    far = clicked((400, 300), 640)
+    assert far.select([large, small], STILL, LIMITS) is None
+    assert far.select([candidate(7, center=(410, 310))], STILL, LIMITS) == 7
+    assert far.select([candidate(7, center=(20, 20)), small], STILL, LIMITS) == 7  # it is known by its number now
 
 
 def lost_at_zero(**last):
     """A selector whose chosen target, number 2, was seen last at the time 0; number 5 was there too."""
     selector = Chosen(number=2)
-    assert select(selector, candidate(2, **last), candidate(5, center=(20, 20))) == 2
+    assert selector.select([candidate(2, **last), candidate(5, center=(20, 20))], STILL, LIMITS) == 2
     return selector
 
 
-def test_chosen_target_that_was_hidden_is_followed_on_under_another_number():
+def test_whoever_was_chosen_and_hidden_is_followed_on_under_another_number():
     selector = lost_at_zero(center=(300, 200), velocity=(50, 0))
-    assert select(selector, candidate(5, center=(20, 20), t=1.0)) is None
+    assert selector.select([candidate(5, center=(20, 20), t=1.0)], STILL, LIMITS) is None
     assert selector.favours(track(6, center=(370, 200), t=1.5))  # 75 px on, where it would be
-    beside = candidate(7, center=(400, 200), t=1.5)
-    assert select(selector, candidate(6, center=(370, 200), t=1.5), beside) == 6
+    there = [candidate(6, center=(370, 200), t=1.5), candidate(7, center=(400, 200), t=1.5)]
+    assert selector.select(there, STILL, LIMITS) == 6
     assert selector.unmet == ""
-    assert select(selector, beside) is None  # it was there at the same time
-    assert select(selector, candidate(8, center=(370, 200), t=4.0)) == 8
+    assert selector.select(there[1:], STILL, LIMITS) is None  # that one was there beside it
+    assert selector.select([candidate(8, center=(370, 200), t=4.0)], STILL, LIMITS) == 8
 
 
 @pytest.mark.parametrize(
@@ -321,33 +325,74 @@ def test_chosen_target_that_was_hidden_is_followed_on_under_another_number():
         (6, {"center": (300, 200), "t": 0.0}),
     ],
 )
-def test_no_other_target_is_taken_for_the_chosen_one(number, where):
+def test_nobody_else_is_taken_for_whoever_was_chosen(number, where):
     selector = lost_at_zero(center=(300, 200), velocity=(50, 0))
     assert not selector.favours(track(number, **where))
-    assert select(selector, candidate(number, **where)) is None
+    assert selector.select([candidate(number, **where)], STILL, LIMITS) is None
     assert selector.unmet == "track 2 is not there"
 
 
-def test_chosen_target_that_has_left_the_view_is_not_back():
+def test_whoever_was_chosen_and_has_left_the_view_is_not_back():
     selector = lost_at_zero(center=(600, 200), velocity=(80, 0), leaves=0.5)
-    assert select(selector, candidate(6, center=(639, 200), velocity=(-80, 0), t=0.6)) is None
+    assert selector.select([candidate(6, center=(639, 200), velocity=(-80, 0), t=0.6)], STILL, LIMITS) is None
+
+
+@pytest.mark.parametrize("name", sorted(POLICIES))
+def test_who_is_out_of_reach_keeps_nobody_waiting(name):
+    selector = POLICIES[name]()
+    assert selector.select([replace(candidate(1), reachable=False)], STILL, LIMITS) == 1  # so that it is said why
+    assert selector.select([replace(candidate(1), reachable=False), candidate(2)], STILL, LIMITS) == 2
+    assert selector.unmet == ""
+    assert not selector.favours(track(1))
+
+
+def test_a_chosen_one_is_followed_in_reach_or_not():
+    selector = Chosen(number=1)
+    assert selector.select([replace(candidate(1), reachable=False), candidate(2)], STILL, LIMITS) == 1
+
+
+def test_a_choice_by_number_says_when_it_is_not_met():
+    selector = Chosen(number=2)
+    assert selector.unmet == "track 2 is not there"
+    assert [selector.favours(track(n)) for n in (1, 2)] == [False, True]
+    selector.select([candidate(1), candidate(2)], STILL, LIMITS)
+    assert selector.unmet == ""
+    selector.select([candidate(1)], STILL, LIMITS)
+    assert selector.unmet == "track 2 is not there"
+
+
+def test_a_choice_by_click_says_when_it_is_not_met():
+    selector = clicked((100.0, 200.0), 500.0)  # 40 px are near
+    near, far = track(1, center=(100, 239)), track(2, center=(100, 241))
+    assert [selector.favours(each) for each in (near, far)] == [True, False]
+    selector.select([candidate(2, center=(100, 241))], STILL, LIMITS)
+    assert selector.unmet == "no track at the click (100, 200)"
+    assert selector.select([candidate(1, center=(100, 239))], STILL, LIMITS) == 1
+    assert selector.unmet == ""
+    assert [selector.favours(track(n, center=(100, 200))) for n in (1, 3)] == [
+        True,
+        False,
+    ]  # it is that one from now on
+    selector.select([], STILL, LIMITS)
+    assert selector.unmet == "track 1, which was at the click (100, 200), is not there any more"
 
 
 def test_each_run_starts_a_selector_anew():
     first, rounds, chosen = FirstCome(), most_served(), Chosen(number=2)
     for selector in (first, rounds, chosen):
-        assert select(selector, candidate(2)) == 2
+        assert selector.select([candidate(2)], STILL, LIMITS) == 2
         selector.start((640, 480))
     # The first would stay, the second is not looked at for long enough yet, the third has gone and come back as 3.
-    assert select(first, candidate(1), candidate(2)) == 1
-    assert select(rounds, candidate(1, leaves=5.0), candidate(2)) == 1
-    assert select(chosen, candidate(3, t=0.5)) is None
+    assert first.select([candidate(1), candidate(2)], STILL, LIMITS) == 1
+    assert rounds.select([candidate(1, leaves=5.0), candidate(2)], STILL, LIMITS) == 1
+    assert chosen.select([candidate(3, t=0.5)], STILL, LIMITS) is None
+    assert selector.unmet == "track 2 is not there"
 
 
 @pytest.mark.parametrize(
     "selector", [FirstCome(), Rounds("most-served"), Chosen(pixel=(3.5, 7.0)), Chosen(number=4)], ids=str
 )
-def test_selector_is_recorded_and_made_again(selector):
+def test_a_selector_is_recorded_and_made_again(selector):
     table = json.loads(json.dumps(selector_table(selector)))
     check_selector_table(table)
     assert make_selector(table) == selector

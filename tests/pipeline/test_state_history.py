@@ -5,17 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from cotarget.fusion import StateHistory
+from cotarget.fusion import REMEMBERED_S, StateHistory
 from cotarget.rig import PanTiltState, ZoomState
 from cotarget.sim.motion import trapezoid
 
 RATE_S = 0.04
-REMEMBERED_S = 1.5
 OFF_DEG = 0.024  # where the acceleration changes between two states
 
 
 def filled(pan, until=1.2, lens=lambda t: 1000.0, phase=0.0):
-    history = StateHistory(REMEMBERED_S)
+    history = StateHistory()
     for t in np.arange(-0.2 + phase, until, RATE_S):
         history.add(PanTiltState(pan(t), -pan(t), True, t), ZoomState(lens(t), True, t))
     return history
@@ -54,7 +53,7 @@ def test_a_lens_moves_evenly_in_the_logarithm():
 
 
 def test_what_was_not_told_is_not_known():
-    history = StateHistory(REMEMBERED_S)
+    history = StateHistory()
     assert history.at(0.0) is None
     history.add(PanTiltState(0.1, 0.2, False, 5.0), ZoomState(700.0, False, 5.0))
     assert (history.at(5.0).pan, history.at(5.0).speed) == (0.1, 0.0)
@@ -70,7 +69,7 @@ def test_what_was_not_told_is_not_known():
 @pytest.mark.parametrize("apart", [1e-4, 1e-3, 2e-3])
 def test_states_that_come_in_pairs_do_not_multiply_their_rounding(apart):
     step, rate = math.radians(0.0514286), math.radians(30.0)
-    history = StateHistory(REMEMBERED_S)
+    history = StateHistory()
     for k in range(40):
         for t in (k * RATE_S, k * RATE_S + apart):
             pan = round(rate * t / step) * step
@@ -82,7 +81,7 @@ def test_states_that_come_in_pairs_do_not_multiply_their_rounding(apart):
 
 
 def test_states_that_come_fast_are_kept_evenly():
-    history = StateHistory(REMEMBERED_S)
+    history = StateHistory()
     for t in np.arange(0.0, 1.0, 0.002):
         history.add(PanTiltState(math.sin(t), 0.0, True, t), ZoomState(1000.0, False, t))
     for t in np.arange(0.0, 0.99, 0.007):
