@@ -23,16 +23,17 @@ from cotarget.pipeline import FROZEN_S, GONE_S, ZOOM_STALE_S, ZOOM_WAIT_S, Follo
 from cotarget.recording.replay import Replay, until_end
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
-from tests.pipeline.test_follow import (
+from tests.support.formula_rig import (
     BOOK,
     CALIBRATION,
     DELAY,
+    FIXED,
+    FRAME_S,
     LATENCY,
-    PLAIN,
     RATE_HZ,
     STEP,
     WIDE,
-    Rig,
+    FormulaRig,
     Seer,
     crossing,
     off,
@@ -44,7 +45,6 @@ from tests.support.recorded_run import ToyDevices, calibration_file, record
 from tests.support.recorded_run import run as recorded
 from tests.support.rigs import guarded, rig_of
 
-FRAME_S = 1 / RATE_HZ
 FAULT = 1.5  # when it happens [s]; by then the target is followed
 # The target crosses at 2 m/s, 10 m away. A command leads the head no farther than 0.15 s of the target's way, what the
 # target has gone since its light fell, and its own way of braking.
@@ -95,7 +95,7 @@ def assert_it_comes_to_rest(rig, since):
 
 # ---------------------------------------------------------------- frames of the fixed camera
 def test_frames_that_stop():
-    rig = Rig(dropped=(FAULT, 100.0))
+    rig = FormulaRig(dropped=(FAULT, 100.0))
     steps, error = attempt(rig, Seer(crossing), 5.0)
     assert isinstance(error, StaleFrameError)
     assert steps[-1].state is State.FOLLOWING
@@ -133,7 +133,7 @@ def shifted(by):
     (shifted(math.nan), "gave a frame of nan s"),
 ])  # fmt: skip
 def test_frames_that_repeat_or_jump_in_time(change, told):
-    rig = Rig()
+    rig = FormulaRig()
     rig.fixed = Faulty(rig.fixed, change)
     steps, error = attempt(rig, Seer(crossing), 5.0)
     assert isinstance(error, StaleFrameError)
@@ -150,7 +150,7 @@ def test_frames_that_repeat_or_jump_in_time(change, told):
 ])  # fmt: skip
 @pytest.mark.parametrize("safe", [False, True])
 def test_a_frame_that_repeats_or_jumps_is_passed_over_and_told(spoil, told, safe):
-    rig, frames, spoilt = Rig(), [], []
+    rig, frames, spoilt = FormulaRig(), [], []
 
     def change(read, t, newer_than, timeout):
         frame = read(newer_than, timeout)
@@ -181,7 +181,7 @@ def test_a_frame_that_repeats_or_jumps_is_passed_over_and_told(spoil, told, safe
 
 def test_time_that_leaps_for_all():
     """The program stood still for 5 s, and the target is elsewhere: it is a new one, and nothing is made of the gap."""
-    rig, gone = Rig(), []
+    rig, gone = FormulaRig(), []
 
     def change(read, t, newer_than, timeout):
         if t > FAULT and not gone:
@@ -197,12 +197,12 @@ def test_time_that_leaps_for_all():
     assert off(rig, still, rig.t) < STEP
     there = rig.pose(math.inf)[0]
     low, high = sorted((before[-1].head.pan, there))
-    assert all(low - FARTHEST < pan < high + FARTHEST for t, pan, _ in rig.moves if t > gone[0])
+    assert all(low - FARTHEST < pan < high + FARTHEST for t, pan, *_ in rig.moves if t > gone[0])
 
 
 def test_times_that_jitter():
     """A frame of a nanosecond after another is no reason to hurry."""
-    rig, odd = Rig(), []
+    rig, odd = FormulaRig(), []
 
     def change(read, t, newer_than, timeout):
         frame = read(newer_than, timeout)
@@ -220,7 +220,7 @@ def test_times_that_jitter():
 
 @pytest.mark.parametrize("camera", ["fixed", "zoom"])
 def test_frames_that_change_their_size(camera):
-    rig = Rig()
+    rig = FormulaRig()
     small = np.zeros((240, 320, 3), np.uint8)
 
     def change(read, t, newer_than, timeout):
@@ -249,7 +249,7 @@ def frozen(rig, camera, since=FAULT):
 
 def test_a_picture_that_stays_the_same_is_told():
     """A server that repeats its last picture with new times: what is seen in it says nothing of what is there."""
-    rig = frozen(Rig(), "fixed")
+    rig = frozen(FormulaRig(), "fixed")
     steps = run(rig, Seer(lambda t: crossing(min(t, FAULT))), FAULT + 3.0)
     told = [step for step in steps if "the fixed camera has shown the same picture for" in step.reason]
     assert told[0].t == pytest.approx(FAULT + FROZEN_S + LATENCY, abs=2 * FRAME_S)
@@ -274,7 +274,7 @@ def blind(rig, since, until=math.inf, waits=0.0):
 @pytest.mark.parametrize("waits", [0.0, 1.0])
 def test_a_zoom_camera_that_is_blind_for_a_while_stops_nothing(waits):
     """The wide view alone keeps the head on the target, and every Step says what is missing."""
-    rig = blind(Rig(), FAULT, FAULT + 1.0, waits)
+    rig = blind(FormulaRig(), FAULT, FAULT + 1.0, waits)
     steps, errors = [], []
     for step in follow(rig_of(rig), CALIBRATION, BOOK, Seer(crossing), seconds=3.5, settings=FollowSettings()):
         steps.append(step)
@@ -295,7 +295,7 @@ def test_a_zoom_camera_that_is_blind_for_a_while_stops_nothing(waits):
 
 def test_a_zoom_camera_that_repeats_its_frame_is_told():
     """Some frames the same are usual, where it is slower than the wide one."""
-    rig, kept = Rig(), []
+    rig, kept = FormulaRig(), []
 
     def change(read, t, newer_than, timeout):
         if t > FAULT:
@@ -330,7 +330,7 @@ class Asked:
 
 def test_a_zoom_picture_that_stays_the_same_is_told_and_not_looked_at_again():
     """What an old picture shows beside the middle would lead the head off a target that the wide view still sees."""
-    rig, asked = frozen(Rig(), "zoom"), Asked()
+    rig, asked = frozen(FormulaRig(), "zoom"), Asked()
     steps = run(rig, Seer(crossing), FAULT + 2.0, finder=lambda *_: asked)
     told = [step for step in steps if "the zoom camera has shown the same picture for" in step.reason]
     assert told[0].t == pytest.approx(FAULT + FROZEN_S + LATENCY, abs=2 * FRAME_S)
@@ -342,14 +342,14 @@ def test_a_zoom_picture_that_stays_the_same_is_told_and_not_looked_at_again():
 
 def test_pictures_that_stay_the_same_in_both_views_are_looked_at():
     """As of a scene without noise in which nothing moves."""
-    rig, asked = frozen(frozen(Rig(), "zoom", since=0.0), "fixed", since=0.0), Asked()
+    rig, asked = frozen(frozen(FormulaRig(), "zoom", since=0.0), "fixed", since=0.0), Asked()
     steps = run(rig, Seer(still), FAULT + 2.0, finder=lambda *_: asked)
     assert asked.times[-1] == steps[-1].zoom.t
     assert "the zoom camera has shown the same picture" not in steps[-1].reason
 
 
 def test_a_zoom_camera_that_is_dead_for_good_is_an_error():
-    rig = blind(Rig(), FAULT)
+    rig = blind(FormulaRig(), FAULT)
     steps, error = attempt(rig, Seer(still), 30.0)
     assert isinstance(error, StaleFrameError)
     assert str(error).startswith("the zoom camera has shown nothing new for 10.")
@@ -359,7 +359,7 @@ def test_a_zoom_camera_that_is_dead_for_good_is_an_error():
 
 
 def test_a_zoom_camera_that_never_gave_a_frame_is_refused_before_anything_moves():
-    rig = blind(Rig(), 0.0)
+    rig = blind(FormulaRig(), 0.0)
     steps, error = attempt(rig, Seer(still), 5.0)
     assert isinstance(error, StaleFrameError)
     assert not steps
@@ -408,12 +408,12 @@ class Crowd:
 
     def detect(self, frame):
         size = 686 * 0.234 / 10.0
-        pixels = PLAIN.project(np.array([self.at(n, frame.t) for n in range(len(self.places))]))
+        pixels = FIXED.project(np.array([self.at(n, frame.t) for n in range(len(self.places))]))
         return [Detection(pixel, np.array([size, 1.4 * size]), 1.0) for pixel in pixels]
 
 
 def test_of_a_hundred_moving_things_one_is_followed():
-    rig, crowd = Rig(), Crowd()
+    rig, crowd = FormulaRig(), Crowd()
     steps = run(rig, crowd, 2.5)
     followed = {step.target.id for step in steps if step.target is not None}
     assert followed == {1}
@@ -422,14 +422,14 @@ def test_of_a_hundred_moving_things_one_is_followed():
     # It is measured at every frame, however many others there are.
     assert all(step.estimate.measured_t == step.fixed.t for step in steps if step.target is not None)
     assert off(rig, lambda t: crowd.at(0, t), rig.t) < 0.01
-    assert len({round(pan, 1) for _, pan, _ in rig.moves}) <= 3  # it does not go from one to the other
+    assert len({round(pan, 1) for _, pan, *_ in rig.moves}) <= 3  # it does not go from one to the other
 
 
 @pytest.mark.parametrize("click", [False, True])
 def test_whoever_is_chosen_of_a_hundred_is_followed(click):
     """Though there are more tracks than are known in 3D."""
-    rig, crowd, number = Rig(), Crowd(), 77
-    pixel = tuple(PLAIN.project(crowd.at(number, 0.2))[0])
+    rig, crowd, number = FormulaRig(), Crowd(), 77
+    pixel = tuple(FIXED.project(crowd.at(number, 0.2))[0])
     selector = Chosen(pixel=pixel, click_part=8 / rig.fixed.size[0]) if click else Chosen(number=number + 1)
     steps = run(rig, crowd, 2.0, selector=selector)
     assert number > FusionSettings.most_filters
@@ -443,7 +443,7 @@ def test_whoever_is_chosen_of_a_hundred_is_followed(click):
     (Chosen(pixel=(20.0, 30.0)), "no track at the click (20, 30)"),
 ])  # fmt: skip
 def test_a_choice_that_meets_nobody_is_told(selector, told):
-    rig = Rig()
+    rig = FormulaRig()
     steps = run(rig, Seer(still), 1.0, selector=selector)
     assert {(step.state, step.reason) for step in steps} == {(State.SEARCHING, told)}
     assert any(track.confirmed for track in steps[-1].tracks)
@@ -451,8 +451,8 @@ def test_a_choice_that_meets_nobody_is_told(selector, told):
 
 
 def test_a_chosen_target_that_has_gone_is_told():
-    rig = Rig()
-    pixel = tuple(PLAIN.project(np.array(still(0)))[0].round())
+    rig = FormulaRig()
+    pixel = tuple(FIXED.project(np.array(still(0)))[0].round())
     steps = run(rig, Seer(still, lambda t: t < 1.0), 3.0, selector=Chosen(pixel=pixel))
     assert [state for state, _ in spans(steps)] == [
         State.SEARCHING,
@@ -468,7 +468,7 @@ def test_a_chosen_target_that_has_gone_is_told():
 
 def test_a_chosen_target_that_was_hidden_for_long_is_followed_on():
     """Its track lives for 0.8 s; then it has another number, and is the same target."""
-    rig = Rig()
+    rig = FormulaRig()
     hidden = run(rig, Seer(still, lambda t: not 1.0 <= t < 2.5), 5.0, selector=Chosen(number=1))
     assert [(state, number) for (state, number), _ in itertools.groupby(hidden, key=followed)][-2:] == [
         (State.SEARCHING, None),
@@ -495,25 +495,25 @@ class Two:
 
 @pytest.mark.parametrize("policy", sorted(POLICIES))
 def test_a_target_beyond_the_limits_keeps_nobody_from_another(policy):
-    rig = Rig(replace(WIDE, pan=(-0.15, 0.15)))
+    rig = FormulaRig(replace(WIDE, pan=(-0.15, 0.15)))
     steps = run(rig, Two(), 4.0, selector=POLICIES[policy]())
     alone = [step for step in steps if 0.3 < step.t < 1.0]
     assert {step.state for step in alone} == {State.UNREACHABLE}
     assert all("beyond the limits" in step.reason for step in alone)
     assert {(step.state, step.target.id) for step in steps if step.t > 2.0} == {(State.FOLLOWING, 2)}
-    assert all(-0.15 <= pan <= 0.15 for _, pan, _ in rig.moves)
+    assert all(-0.15 <= pan <= 0.15 for _, pan, *_ in rig.moves)
     assert rig.pan.motor(rig.t)[1] == 0.0
 
 
 def test_a_chosen_target_beyond_the_limits_is_not_exchanged():
-    rig = Rig(replace(WIDE, pan=(-0.15, 0.15)))
+    rig = FormulaRig(replace(WIDE, pan=(-0.15, 0.15)))
     steps = run(rig, Two(), 3.0, selector=Chosen(number=1))
     assert {(step.state, step.target.id) for step in steps if step.t > 0.3} == {(State.UNREACHABLE, 1)}
     assert not rig.moves
 
 
 def test_frames_that_repeat_end_a_run_behind_the_safety_layer_too():
-    rig = Rig()
+    rig = FormulaRig()
     rig.fixed = Faulty(rig.fixed, again([]))
     rig.head.halt = lambda: [axis.halt(rig.t) for axis in (rig.pan, rig.tilt)]
     rig.board, rig.close = None, lambda: None
