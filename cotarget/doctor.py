@@ -236,7 +236,7 @@ def _fix(error: CotargetError, name: str, there: str, rig: Path) -> str:
         case InUseError():
             return "end the program that has it" + (f", which 'fuser -v {there}' names" if "://" not in there else "")
         case NoPermissionError():
-            return "sudo usermod -a -G dialout $USER, then log in anew"
+            return "sudo usermod -a -G dialout $USER, then log in again"
         case UncalibratedError():
             return f"cotarget reset-head --rig {rig}"
         case LoginError():

@@ -182,7 +182,7 @@ def _check_size(frame: Frame, camera: Camera, name: str) -> None:
         was_width, was_height = camera.size
         raise DeviceError(
             f"the {name} camera gave a frame of {width}x{height}, and not of {was_width}x{was_height}: set it back, or "
-            "open the rig anew"
+            "open the rig again"
         )
 
 

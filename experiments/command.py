@@ -133,8 +133,8 @@ def _cases(
 ) -> Iterator[Case]:
     """Make the cases of one experiment, one for each combination of values."""
     experiment, several = known[name](), list[Any]()
-    told = {key: value for key in ("seeds", "seed_base") if (value := getattr(given, key)) is not None}
-    base = dataclasses.replace(experiment.quick if given.quick else experiment.settings, **told)
+    seeds = {key: value for key in ("seeds", "seed_base") if (value := getattr(given, key)) is not None}
+    base = dataclasses.replace(experiment.quick if given.quick else experiment.settings, **seeds)
     for picked in itertools.product(*([(key, text) for text in values] for key, values in texts.items())):
         settings = validate(type(base), {key: _parsed(text) for key, text in picked}, name, base=base)
         for key, _ in picked:

@@ -209,8 +209,8 @@ LOGGED = ("seconds", "cpu_s", "renders", "version", "host", "failed")  # columns
 def identity(case: Case) -> bytes:
     """Give the experiment and the settings that its rows depend on, as settings.json has them."""
     settings = {key: value for key, value in dataclasses.asdict(case.settings).items() if key != "seeds"}
-    told = {"experiment": case.experiment.name, "settings": settings}
-    return (json.dumps(told, indent=2, default=str) + "\n").encode()
+    found = {"experiment": case.experiment.name, "settings": settings}
+    return (json.dumps(found, indent=2, default=str) + "\n").encode()
 
 
 def missing(case: Case, mine: str = "") -> list[int]:
@@ -227,11 +227,11 @@ def missing(case: Case, mine: str = "") -> list[int]:
     if path.exists() and path.read_bytes() != identity(case):
         raise ConfigError(
             f"{path}: is of other settings; ask as before (--quick, --seed-base, --set), take another folder with "
-            "--out, or begin anew with --fresh"
+            "--out, or start over with --fresh"
         )
     for other in {row["version"] for row in log_of(case).values()} - {mine} if mine else ():
         raise ConfigError(
-            f"{case.folder}: is of cotarget {other}, this is {mine}; take another folder with --out, begin anew with "
+            f"{case.folder}: is of cotarget {other}, this is {mine}; take another folder with --out, start over with "
             "--fresh, or keep it with --any-code"
         )
     return [number for number in case.numbers if not rows_file(case, number).exists()]
@@ -283,10 +283,10 @@ def csv_of(rows: Iterable[Row]) -> bytes:
     Raises:
         TypeError: a value is no number, text or truth value.
     """
-    told, text = list(rows), io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in told for key in row)))
+    kept, text = list(rows), io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in kept for key in row)))
     writer.writeheader()
-    writer.writerows({key: _cell(value) for key, value in row.items()} for row in told)
+    writer.writerows({key: _cell(value) for key, value in row.items()} for row in kept)
     return text.getvalue().encode()
 
 

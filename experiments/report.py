@@ -95,14 +95,14 @@ def _beside(
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     reached_by = dict(leaves(plain(figures)))
     found: list[tuple[Bound, Callable[[float], None]]] = []
-    for trail, told in leaves(tree):
+    for trail, limit in leaves(tree):
         kind, of = (trail[-1], trail[:-1]) if trail and trail[-1] in KINDS else (KINDS[0], trail)
-        pair = kind == "within" and isinstance(told, list) and len(told) == 2
-        if not all(isinstance(each, int | float) for each in (told if pair else () if told is None else (told,))):
-            raise ConfigError(f"{path}: {' / '.join(trail)}: {told!r} is no bound")
+        pair = kind == "within" and isinstance(limit, list) and len(limit) == 2
+        if not all(isinstance(each, int | float) for each in (limit if pair else () if limit is None else (limit,))):
+            raise ConfigError(f"{path}: {' / '.join(trail)}: {limit!r} is no bound")
         reached = reached_by.get(of)
         value = float(reached) if isinstance(reached, int | float) and not isinstance(reached, bool) else None
-        bound = Bound(" / ".join(of), kind, tuple(told) if pair else told, value)
+        bound = Bound(" / ".join(of), kind, tuple(limit) if pair else limit, value)
         found.append((bound, functools.partial(_put, tree, trail)))
     return found, tree
 
@@ -233,14 +233,14 @@ def write_report(folder: Path, outcomes: Sequence[Outcome], skipped: Mapping[str
         ConfigError: the page cannot be written.
     """
     wrong = [outcome.case.title for outcome in outcomes if not outcome.ok]
-    text = f"{len(outcomes)} experiments; not as they should be: {', '.join(wrong) or 'none'}."
+    text = f"{len(wrong)} of {len(outcomes)} experiments failed{': ' if wrong else '.'}{', '.join(wrong)}"
     page = render(
         "report.html",
         Path(__file__).parent,
         heading="The experiments of cotarget",
         about=[command],
         verdict={"level": "bad" if wrong else "good", "text": text},
-        label="Something is wrong" if wrong else "All as it should be",
+        label="Failed" if wrong else "Passed",
         overview=_html([_line(outcome) for outcome in outcomes]),
         skipped=_html([{"not run": title, "why": why} for title, why in skipped.items()]),
         cases=[_case(outcome) for outcome in outcomes],

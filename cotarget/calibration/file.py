@@ -370,7 +370,7 @@ def check_covariance(covariance: Covariance, stops: int) -> None:
     if unknown := [name for name in names if name not in known]:
         raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")
     if not names:
-        raise CalibrationError("covariance.parameters: is empty; a method that tells no uncertainty has null instead")
+        raise CalibrationError("covariance.parameters: is empty; a method without uncertainty has null instead")
     if twice := [name for i, name in enumerate(names) if name in names[:i]]:
         raise CalibrationError(f"covariance.parameters: '{twice[0]}' is there twice")
     variances = np.diagonal(C)

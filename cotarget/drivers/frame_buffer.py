@@ -301,7 +301,7 @@ class FrameBuffer:
             if (size := (image.shape[1], image.shape[0])) != self._size:
                 now, was = (f"{width}x{height}" for width, height in (size, self._size))
                 raise DeviceError(
-                    f"{self.name} now sends {now} where it sent {was}: set its resolution back, or open it anew"
+                    f"{self.name} now sends {now} where it sent {was}: set its resolution back, or open it again"
                 )
             return Frame(image, newest.t)
 

@@ -101,7 +101,7 @@ def _size(header: bytes | bytearray) -> tuple[int, int]:
 # Decoding
 
 # Some cameras put further bytes before every image's last marker (github.com/ros-drivers/axis_camera, issue 51: about
-# 650 of them). Such images are accepted once so many in a row had them: a few where no other image came before, and
+# 650 of them). Such images are accepted once several in a row had them: a few where no other image came before, and
 # many where an exact one shows that this camera usually sends none.
 USUAL, USUAL_AFTER_EXACT = 5, 100
 # libjpeg-turbo's warning of such bytes; it comes after all blocks are decoded.

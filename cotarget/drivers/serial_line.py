@@ -157,7 +157,7 @@ def _why_not(name: str, error: Exception) -> DeviceError:
             return DeviceError(f"there is no port {name} for the pan-tilt unit; serial ports here: {there}")
         case errno.EACCES | errno.EPERM:
             return NoPermissionError(
-                f"no permission to use {name}; add yourself to the group that owns it, often dialout, and log in anew"
+                f"no permission to use {name}; add yourself to the group that owns it, often dialout, and log in again"
             )
         case errno.EBUSY | errno.EAGAIN:
             return InUseError(f"{name} is in use by another program")

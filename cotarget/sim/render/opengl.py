@@ -214,7 +214,7 @@ class Canvas:
             self._renderer._gl_context.make_current()
 
     def _set_samples(self, samples: int) -> None:
-        """Make the offscreen buffer anew, with another number of samples a pixel.
+        """Remake the offscreen buffer with another number of samples a pixel.
 
         It takes a millisecond. A second context for this would hold all textures once more, some 90 MB.
         """
