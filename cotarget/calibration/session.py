@@ -1,7 +1,6 @@
 """Capture session: drive an uncalibrated rig through board placements and head poses to views that calibrate it.
 
-The board, the image sizes, the head's limits and the lens's nominal focal length are known; the fixed camera's focal
-length, Gamma and T are not. The session estimates a rough model as it goes (`learn_fixed`, `learn_zoom`):
+The fixed camera's focal length, Gamma and T are unknown at first. The session estimates a rough model as it goes:
 
 1. A board straight ahead gives the fixed camera's focal length, and tilted ones its rough intrinsics.
 2. A scan with the head finds the board in the zoom image. Two small turns give the rotation of T, and with it Gamma, up
@@ -10,7 +9,7 @@ length, Gamma and T are not. The session estimates a rough model as it goes (`le
 4. For further zoom samples (`see_stops`), boards stand far away, where the fixed camera still sees them whole. At each
    board the lens goes through all zoom samples, and the head brings parts of the board all over the zoom image.
 
-Before each image, board, head and lens stand still. Measurements: docs/design-notes.md.
+Before each image, board, head and lens stand still. Reasons for the numbers: docs/design-notes.md.
 """
 
 import contextlib
@@ -74,19 +73,17 @@ from cotarget.rig import Clock, Frame, Image, PanTiltState, Rig, ZoomCamera, Zoo
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 
 log = logging.getLogger(__name__)
-# Requested poses are rounded to 0.1 mm and 0.1 mrad, finer than a person holds a board. The fits behind a plan sum in
-# an order that varies with the threads; unrounded, their last digits would make two runs with the same seed diverge.
+# Requested poses are rounded to 0.1 mm and 0.1 mrad. The fits behind a plan sum in an order that varies with the
+# threads; unrounded, their last digits would make two runs with the same seed diverge.
 WISH_DECIMALS = 4
 # Time after everything stands until an image counts [s], for vibrations and for an exposure that began before. The long
-# one is for a rig whose camera latency is not measured yet, so that frames may be dated too late.
+# one is for real cameras, whose latency is not measured yet, so that frames may be dated too late.
 SETTLE, SETTLE_LONG = 0.05, 0.5
 FRAME_TIMEOUT = 5.0  # several times the latency of a slow network camera [s]
 # A board that a person holds is settled when its corners move by less than HELD_PX between two images HELD_FOR seconds
 # apart, and by at least LEFT_PX since the request (mean over the corners).
 HELD_PX, HELD_FOR, LEFT_PX = 0.3, 0.4, 8.0
-# Tries of a turn, and of an image: on a busy machine the watchdog may halt the head on its way, and frames may be too
-# old when they are read.
-TRIES = 3
+TRIES = 3  # of a turn or image: on a busy machine the watchdog may halt the head, and frames may be too old
 LENS_TOLERANCE = 0.03  # relative to the focal length; a step of a usual lens is 0.02
 # Finds a board's corners in an image, given the view to be filled, whose corners are still nan.
 CornerFinder = Callable[[Image, View], Array | None]
@@ -97,11 +94,12 @@ Seen = TypeVar("Seen")
 class CaptureRecorder:
     """Move head, lens and board, take images, and keep captures and views."""
 
-    rig: Rig  # the rig
-    board: BoardConfig  # the board in use
+    rig: Rig
+    board: BoardConfig
     directory: Path | None = None  # folder for the captures; None to keep the corners only
-    views: list[View] = field(default_factory=list)  # views found so far
+    views: list[View] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)  # images in which a board was expected but not found
+    misses: list[tuple[Array, float]] = field(default_factory=list)  # boards that the fixed camera did not see
     number: int = -1  # number of the present placement
     _captures: list[Capture] = field(default_factory=list)
     _still_since: float = 0.0
@@ -116,7 +114,7 @@ class CaptureRecorder:
         """Let images count only from a time on [s]."""
         self._still_since = max(self._still_since, t)
 
-    def _stands_since(self, t: float) -> None:
+    def _settle(self, t: float) -> None:
         """Let images count from some time after everything stands [s]."""
         self._wait_for(t + (SETTLE_LONG if self.rig.spec.real_time else SETTLE))
 
@@ -137,14 +135,14 @@ class CaptureRecorder:
         """Send the lens to a nominal focal length, wait until it stands, and return what it reports [px]."""
         clock = self.rig.clock
         begin, wanted = clock.now(), self.rig.zoom.zoom(nominal_px)
-        self._note(begin, "zoom", nominal_px, wanted)
+        self._log(begin, "zoom", nominal_px, wanted)
         clock.sleep_until(clock.now() + POLL)
         state = wait_for_lens(self.rig)
         if abs(np.log(state.focal_px / wanted)) > LENS_TOLERANCE:
             raise CalibrationError(
                 f"the zoom lens stands at {state.focal_px:.0f} px where {wanted:.0f} px was commanded"
             )
-        self._stands_since(state.t)
+        self._settle(state.t)
         return state.focal_px
 
     def present(self, T_fixed_board: RigidTransform) -> None:
@@ -154,11 +152,11 @@ class CaptureRecorder:
             Rotation.from_rotvec(np.round(T_fixed_board.rotation.as_rotvec(), WISH_DECIMALS)),
         )
         before = self._fixed_corners() if self.rig.board.patience else None
-        self._note(self.rig.clock.now(), "present", pose_dict(wish))
+        self._log(self.rig.clock.now(), "present", pose_dict(wish))
         self.rig.board.present(wish)
         if self.rig.board.patience:
             self._wait_until_held(before)
-        self._stands_since(self.rig.clock.now())
+        self._settle(self.rig.clock.now())
         self.number += 1
 
     def _fixed_corners(self) -> Array | None:
@@ -181,9 +179,7 @@ class CaptureRecorder:
             clock.sleep_until(clock.now() + HELD_FOR)
 
     def turn(self, pan: float, tilt: float) -> None:
-        """Turn the head and wait until it stands.
-
-        A head that is halted on its way is sent again, up to `TRIES` times in all. After an emergency stop it refuses.
+        """Turn the head and wait until it stands; send one that is halted on its way again, up to `TRIES` times in all.
 
         Raises:
             CalibrationError: the head stands elsewhere than commanded.
@@ -196,16 +192,16 @@ class CaptureRecorder:
             try:
                 wanted = self.rig.head.move(*wish, wait=True)
             except HaltedError as error:
-                self._note(begin, "turn", wish)
+                self._log(begin, "turn", wish)
                 if not left:
                     raise
                 log.warning("%s; the head is sent again", error)
                 continue
-            self._note(begin, "turn", wish, wanted)
+            self._log(begin, "turn", wish, wanted)
             way = max(abs(wanted[0] - before.pan), abs(wanted[1] - before.tilt))
             state, arrived = wait_for_head(self.rig, wanted, way)
             if arrived:
-                self._stands_since(state.t)
+                self._settle(state.t)
                 return
         raise CalibrationError(
             f"the head stands at pan {np.degrees(state.pan):z.2f}, tilt {np.degrees(state.tilt):z.2f} degrees "
@@ -218,7 +214,7 @@ class CaptureRecorder:
         return self._keep(Capture(frame.image, "fixed", self.number, t=frame.t), expected)
 
     def see_zoom(self, *, expected: bool = True, find: CornerFinder | None = None) -> View | None:
-        """Take an image with the zoom camera at the present head pose and find the board in it.
+        """Take an image with the zoom camera and find the board in it.
 
         Where the board is ``expected``, the search is thorough, and an image without it is rejected.
         """
@@ -227,10 +223,7 @@ class CaptureRecorder:
         return self._keep(capture, expected, find)
 
     def _look(self, look: Callable[[float], Seen]) -> Seen:
-        """Read a frame, and retry where it comes too late, up to `TRIES` times in all.
-
-        Before each retry the head is sent again to its last goal. It refuses after an emergency stop.
-        """
+        """Read a frame; retry where it comes too late, with the head sent to its goal again, `TRIES` times in all."""
         for _ in range(TRIES - 1):
             try:
                 return look(self._still_since)
@@ -261,7 +254,15 @@ class CaptureRecorder:
         if self.directory is not None and self._captures:
             write_index(self.directory, CaptureIndex(self.board, self.rig.spec.zoom.pitch_mm, tuple(self._captures)))
 
-    def _note(self, t: float, do: str, asked: object, got: object = None) -> None:
+    def coverage(self, camera: CameraName, nominal_px: float | None = None) -> Coverage:
+        """Count the corners that a camera has seen so far, at one nominal focal length [px] or at any."""
+        found = Coverage((self.rig.fixed if camera == "fixed" else self.rig.zoom).size, misses=self.misses)
+        for view in self.views:
+            if view.camera == camera and (nominal_px is None or same_focal(view, nominal_px)):
+                found.add(view.corners_px)
+        return found
+
+    def _log(self, t: float, do: str, asked: object, got: object = None) -> None:
         """Log a command, where captures are kept."""
         if self.directory is not None:
             write_command(self.directory, t, do, asked, got)
@@ -315,7 +316,7 @@ SMALL_TURN = np.radians(7.0)  # enough for T's rotation, and keeps a central boa
 ROUGH_MARGIN = 0.04  # border that plans keep clear while the model is rough, over the image's width
 ENOUGH_VIEWS = 12  # zoom views from which the zoom intrinsics and T's translation join the rough fit
 ROUGH_RMS_PX = 3.0  # a rough fit with a larger rms starts again
-OTHER_LENS = 1.25  # ratio of focal lengths from which the lens and not the head is wrong; a few boards tell a tenth
+OTHER_LENS = 1.25  # ratio of focal lengths above which the lens is wrong and not the head; boards give it to a tenth
 CENTRAL = 0.12  # a board is central within this distance of the image's centre, over the image's width
 GAMMA_ALONE: tuple[Block, ...] = ("gamma",)
 ROUGH_BLOCKS: tuple[Block, ...] = ("fixed", "zoom", "gamma", "hand", "head")
@@ -368,27 +369,21 @@ def _rough_lens(recorder: CaptureRecorder, camera: CameraName) -> Intrinsics:
 
 def learn_zoom(recorder: CaptureRecorder, model: BundleModel) -> BundleModel:
     """Estimate rough Gamma and T: find the board in the zoom image, and turn the head a little."""
-    focal = recorder.rig.zoom.state().focal_px
-    zoom = _pinhole(recorder.rig.zoom.size, focal)
     view = _find_with_zoom(recorder, model)
     by_pan, by_tilt = _turn_a_little(recorder, view)
     centred = _centred(recorder, view, by_pan, by_tilt)
     if centred is not view:
         by_pan, by_tilt = _turn_a_little(recorder, centred)
-    _present_otherwise_tilted(recorder, model, centred)
-    still = RigidTransform.identity()
-    model = replace(model, zoom_head=ZoomHead(ZoomLens((focal,), (zoom,)), still, still))
-    model = _likeliest(model, recorder, [centred, by_pan, by_tilt])
-    return refitted(model, recorder).model
-
-
-def _present_otherwise_tilted(recorder: CaptureRecorder, model: BundleModel, view: View) -> None:
-    """Present the board in the same place with another tilt; only the true one of Gamma's mirror images fits both."""
-    middle = _pose_of(recorder, model, view.board).apply(recorder.points.mean(axis=0))
-    recorder.turn(view.pan, view.tilt)
+    # The board in the same place with another tilt: only the true one of Gamma's mirror images fits both.
+    middle = _pose_of(recorder, model, centred.board).apply(recorder.points.mean(axis=0))
+    recorder.turn(centred.pan, centred.tilt)
     recorder.present(facing_board(recorder.board, middle, CLEARLY_TILTED.inv()))
     recorder.see_fixed()
     recorder.see_zoom(expected=False)
+    focal, still = recorder.rig.zoom.state().focal_px, RigidTransform.identity()
+    lens = ZoomLens((focal,), (_pinhole(recorder.rig.zoom.size, focal),))
+    model = _likeliest(replace(model, zoom_head=ZoomHead(lens, still, still)), recorder, [centred, by_pan, by_tilt])
+    return refitted(model, recorder).model
 
 
 def _pose_of(recorder: CaptureRecorder, model: BundleModel, number: int) -> RigidTransform:
@@ -400,8 +395,7 @@ def _pose_of(recorder: CaptureRecorder, model: BundleModel, number: int) -> Rigi
 def _likeliest(model: BundleModel, recorder: CaptureRecorder, seen: Sequence[View]) -> BundleModel:
     """Choose rough Gamma and T from one placement seen from three head poses.
 
-    Each view has two possible poses of the board. Every combination makes a model, and the one that fits all views so
-    far best is chosen.
+    Each view has two possible poses of the board. Of all combinations, the one that fits all views so far best wins.
     """
     points, zoom = recorder.points, model.head.lens.stops[0]
     heads = [base_head(view.pan, view.tilt) for view in seen]
@@ -427,16 +421,13 @@ def _likeliest(model: BundleModel, recorder: CaptureRecorder, seen: Sequence[Vie
     return min(results, key=lambda one: one[0])[1]
 
 
-def _check_lens(told_px: float, recorder: CaptureRecorder) -> None:
-    """Refuse a zoom lens whose focal length is far from what the boards in its images show.
-
-    Through a wrong focal length the camera seems to turn by another angle than the head.
-    """
+def _check_lens(reported_px: float, recorder: CaptureRecorder) -> None:
+    """Refuse a zoom lens whose focal length is far from what the boards in its images show."""
     seen_px = _rough_lens(recorder, "zoom").focal_px[0]
-    if max(seen_px / told_px, told_px / seen_px) > OTHER_LENS:
+    if max(seen_px / reported_px, reported_px / seen_px) > OTHER_LENS:
         raise CalibrationError(
-            f"the zoom lens reports a focal length of {told_px:.0f} px, and the boards in its pictures look as through "
-            f"one of about {seen_px:.0f} px; check its focal lengths and pitch_mm"
+            f"the zoom lens reports a focal length of {reported_px:.0f} px, but the boards in its images show about "
+            f"{seen_px:.0f} px; check its focal lengths and pitch_mm"
         )
 
 
@@ -495,10 +486,8 @@ def _turn_a_little(recorder: CaptureRecorder, view: View) -> tuple[View, View]:
 def _centred(recorder: CaptureRecorder, view: View, by_pan: View, by_tilt: View) -> View:
     """Bring the board to the middle of the zoom image, where the unknown distortion does not bias its pose.
 
-    The views after the two turns give the image Jacobian by pan and tilt, for any roll of the camera.
-
-    Returns:
-        View of the centred board; the view given, where the board is central already or is lost on the way.
+    The views after the two turns give the image Jacobian by pan and tilt. Returns the view given, where the board is
+    central already or is lost on the way.
     """
     common = view.seen & by_pan.seen & by_tilt.seen
     if not common.any():
@@ -525,8 +514,8 @@ def refitted(model: BundleModel, recorder: CaptureRecorder) -> Fit:
     # The intrinsics from the first views are too far off: start again with intrinsics from all views.
     lens = ZoomLens(model.head.lens.nominal_px, (_rough_lens(recorder, "zoom"),))
     fixed = FixedCamera(_rough_lens(recorder, "fixed"))
-    afresh = place_boards(replace(model, fixed=fixed).with_zoom_head(lens=lens), views, points)
-    again = fit(fit(afresh, views, points, GAMMA_ALONE).model, views, points, ROUGH_BLOCKS)
+    start = place_boards(replace(model, fixed=fixed).with_zoom_head(lens=lens), views, points)
+    again = fit(fit(start, views, points, GAMMA_ALONE).model, views, points, ROUGH_BLOCKS)
     return min((result, again), key=lambda one: one.rms_px)
 
 
@@ -552,8 +541,7 @@ def wait_for_lens(rig: Rig) -> ZoomState:
 def wait_for_head(rig: Rig, wanted: tuple[float, float], way: float) -> tuple[PanTiltState, bool]:
     """Wait until the head stands where it was commanded [rad], or the timeout for its way there [rad] is over.
 
-    Returns:
-        State of the head, and True if it has arrived.
+    Returns the head's state, and True if it has arrived.
     """
     head, clock = rig.head, rig.clock
     limits = head.limits
@@ -588,18 +576,14 @@ def see_stops(
     tell: Callable[[str], None],
 ) -> BundleModel:
     """Take views at all zoom samples but the first, and return the model with those that were seen."""
-    coverage = {"fixed": Coverage(recorder.rig.fixed.size)}
-    for view in recorder.views:
-        if view.camera == "fixed":
-            coverage["fixed"].add(view.corners_px)
     reachable = functools.partial(_reachable, recorder, model)
-    at_stop: dict[int, Coverage] = {}
     only_fixed = replace(model, zoom_head=None)
     done = 0
     for _ in range(ATTEMPTS * placements):
         if done == placements:
             break
         share = FARTHEST_SHARE - (FARTHEST_SHARE - NEAREST_SHARE) * done / max(placements - 1, 1)
+        coverage = {"fixed": recorder.coverage("fixed")}
         wishes = plan_placements(
             only_fixed, recorder.board, coverage, [share], rng, shared=False, margin_px=BORDER_PX, accept=reachable
         )
@@ -608,18 +592,16 @@ def see_stops(
         recorder.present(wishes[0])
         fixed_view = recorder.see_fixed()
         if fixed_view is None:
-            coverage["fixed"].misses.append(where_in(model.fixed.lens, recorder.board, wishes[0]))
+            recorder.misses.append(where_in(model.fixed.lens, recorder.board, wishes[0]))
             continue
         done += 1
-        coverage["fixed"].add(fixed_view.corners_px)
         for i, stop in enumerate(stops[1:], start=2):
             tell(f"zoom stop {i} of {len(stops)}, board {done} of {placements}")
             nominal = recorder.zoom(stop)
             number, guessed = _stop_at(model, nominal)
             if not number:  # a lens with few positions goes to the first one again
                 continue
-            cover = at_stop.setdefault(number, Coverage(recorder.rig.zoom.size))
-            learnt = _see_stop(recorder, guessed, number, fixed_view, cover, rng)
+            learnt = _see_stop(recorder, guessed, number, fixed_view, rng)
             if learnt is None:
                 break  # a sample that was not seen cannot predict the next one
             model = learnt
@@ -638,8 +620,7 @@ def _reachable(recorder: CaptureRecorder, model: BundleModel, wish: RigidTransfo
 def _stop_at(model: BundleModel, nominal: float) -> tuple[int, BundleModel]:
     """Find the zoom sample at a nominal focal length [px]; beyond the last one, add it to the model.
 
-    Returns:
-        Number of the zoom sample, and the model that contains it.
+    Returns its number, and the model that contains it.
     """
     lens = model.head.lens
     away = np.abs(np.log(np.array(lens.nominal_px) / nominal))
@@ -649,53 +630,41 @@ def _stop_at(model: BundleModel, nominal: float) -> tuple[int, BundleModel]:
 
 
 def _see_stop(
-    recorder: CaptureRecorder,
-    model: BundleModel,
-    number: int,
-    fixed_view: View,
-    coverage: Coverage,
-    rng: np.random.Generator,
+    recorder: CaptureRecorder, model: BundleModel, number: int, fixed_view: View, rng: np.random.Generator
 ) -> BundleModel | None:
     """Take views of the present placement at a zoom sample; fit the sample when it is first seen.
 
-    Returns:
-        The model with the zoom sample; None where a sample not yet fitted was not seen.
+    Returns the model with the zoom sample; None where a sample not yet fitted was not seen.
     """
     points, nominal = recorder.points, model.head.lens.nominal_px[number]
     known = any(view.camera == "zoom" and same_focal(view, nominal) for view in recorder.views)
     placed = place_boards(model, [fixed_view], points)
     here: list[View] = []
     for _ in range(VIEWS_A_STOP if known else FIRST_VIEWS):
-        seen = _see_part(recorder, placed, nominal, coverage, rng)
+        seen = _see_part(recorder, placed, nominal, rng)
         if seen is not None and not known:
             here.append(seen)
             placed = fit_stop(placed, number, [fixed_view, *here], points)
     return replace(model, zoom_head=placed.zoom_head) if known or here else None
 
 
-def _see_part(
-    recorder: CaptureRecorder, model: BundleModel, nominal: float, coverage: Coverage, rng: np.random.Generator
-) -> View | None:
+def _see_part(recorder: CaptureRecorder, model: BundleModel, nominal: float, rng: np.random.Generator) -> View | None:
     """Turn the head so that a part of the board covers new parts of the zoom image, and take a view."""
-    turn = plan_part(recorder, model, nominal, coverage, rng)
+    turn = _plan_part(recorder, model, nominal, rng)
     if turn is None:
         return None
     recorder.turn(*turn)
-    view = recorder.see_zoom(find=lambda image, view: find_expected(image, view, model, recorder.board))
-    if view is not None:
-        coverage.add(view.corners_px)
-    return view
+    return recorder.see_zoom(find=lambda image, view: find_expected(image, view, model, recorder.board))
 
 
-def plan_part(
-    recorder: CaptureRecorder, model: BundleModel, nominal: float, coverage: Coverage, rng: np.random.Generator
+def _plan_part(
+    recorder: CaptureRecorder, model: BundleModel, nominal: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Choose the head pose that adds most to the coverage, of random poses that bring a corner to a pixel.
+    """Choose the pan and tilt [rad] that add most to the coverage, of random ones that bring a corner to a pixel.
 
-    Returns:
-        Pan and tilt [rad]; None where no pose within the limits shows enough of the present placement.
+    None where no pose within the limits shows enough of the present placement.
     """
-    head, points = model.head, recorder.points
+    head, points, coverage = model.head, recorder.points, recorder.coverage("zoom", nominal)
     lens, hand = head.lens.at(nominal), head.hand_eye(nominal)
     T_base_board = head.T_base_fixed * model.boards[recorder.number]
     chosen = points[rng.integers(len(points), size=CANDIDATES)]
@@ -797,12 +766,7 @@ def capture_session(
     stops: int = 1,
     far_placements: int = 0,
 ) -> None:
-    """Run a capture session: fill a recorder with views that calibrate its rig; see `calibrate` for the arguments.
-
-    Raises:
-        CalibrationError: a camera never sees the board, or the head or the lens fails.
-        ConfigError: the board looks the same upside down, or there are too few placements or zoom samples.
-    """
+    """Run a capture session: fill a recorder with views that calibrate its rig; see `calibrate`."""
     check_board(recorder.board)
     _check_least("placements", placements, FEWEST_PLACEMENTS)
     _check_least("stops", stops, 1)
@@ -872,16 +836,13 @@ def _cover(
     tell: Callable[[str], None],
 ) -> BundleModel:
     """Take views of placements that cover both images, from several head poses each, and refine the rough model."""
-    coverage = {"fixed": Coverage(recorder.rig.fixed.size), "zoom": Coverage(recorder.rig.zoom.size)}
-    for view in recorder.views:
-        coverage[view.camera].add(view.corners_px)
     predicted: PredictedAccuracy | None = None
     misses = done = 0
     while recorder.number + 1 < placements:
         # After a miss the rough model's distortion is wrong near the border, so the next placement keeps farther away.
         margin = min((ROUGH_MARGIN if done < REFIT_ALWAYS else FINE_MARGIN) * MARGIN_GROWTH**misses, WIDEST_MARGIN)
         recorder.turn(0.0, 0.0)
-        wish = _next_placement(recorder, model, coverage, rng, margin, predicted)
+        wish = _next_placement(recorder, model, rng, margin, predicted)
         recorder.present(wish)
         error = "" if predicted is None else f", predicted error {np.degrees(predicted.error()):.4f} degrees"
         tell(f"board {recorder.number + 1} of {placements}{error}")
@@ -891,9 +852,9 @@ def _cover(
         if misses > MOST_MISSES:
             raise CalibrationError(f"the fixed camera lost the board: not seen {misses} times in a row")
         if fixed_view is None:
-            coverage["fixed"].misses.append(where_in(model.fixed.lens, recorder.board, wish))
+            recorder.misses.append(where_in(model.fixed.lens, recorder.board, wish))
             continue
-        T = _see_from_everywhere(recorder, model, wish, fixed_view, coverage, margin, rng)
+        T = _see_from_everywhere(recorder, model, wish, fixed_view, margin, rng)
         done += 1
         if done <= REFIT_ALWAYS or done % REFIT_EVERY == 0 or missed:
             found = refitted(model, recorder)
@@ -908,7 +869,6 @@ def _cover(
 def _next_placement(
     recorder: CaptureRecorder,
     model: BundleModel,
-    coverage: dict[str, Coverage],
     rng: np.random.Generator,
     margin: float,
     predicted: PredictedAccuracy | None,
@@ -918,6 +878,7 @@ def _next_placement(
     Before the accuracy can be predicted, it is the one that most head poses show.
     """
     board, limits, points = recorder.board, recorder.rig.head.limits, recorder.points
+    coverage = {"fixed": recorder.coverage("fixed"), "zoom": recorder.coverage("zoom")}
     margin_px = margin * model.fixed.size[0]
     shares = [preferred_share(recorder.number), *rng.uniform(size=CHOICES - 1)]
     wishes = plan_placements(model, board, coverage, shares[: CHOICES // 2], rng, shared=True, margin_px=margin_px)
@@ -944,27 +905,21 @@ def _see_from_everywhere(
     model: BundleModel,
     wish: RigidTransform,
     fixed_view: View,
-    coverage: dict[str, Coverage],
     margin: float,
     rng: np.random.Generator,
 ) -> RigidTransform:
-    """Take the zoom views of a placement, home first, and return the board's pose T_fixed_board.
-
-    The pose comes from the fixed camera's view.
-    """
-    rig, board = recorder.rig, recorder.board
+    """Take the zoom views of a placement, home first, and return T_fixed_board from the fixed camera's view."""
+    rig, board, coverage = recorder.rig, recorder.board, recorder.coverage("zoom")
     # Of the view's two possible poses, the one nearer to the requested rotation.
     poses = pose_candidates(model.fixed.lens, fixed_view.corners_px, recorder.points)
     T = min(poses, key=lambda pose: float((pose.rotation * wish.rotation.inv()).magnitude()))
     home = seen_at_home(model, T, board)
     turns = plan_poses(
-        model, T, board, coverage["zoom"], rig.head.limits, MOVED_VIEWS + (not home), rng, margin * rig.zoom.size[0]
+        model, T, board, coverage, rig.head.limits, MOVED_VIEWS + (not home), rng, margin * rig.zoom.size[0]
     )
     if home:
         recorder.see_zoom()
     for pan, tilt in turns:
         recorder.turn(pan, tilt)
         recorder.see_zoom()
-    for view in recorder.of_placement(recorder.number):
-        coverage[view.camera].add(view.corners_px)
     return T
