@@ -19,7 +19,7 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import TargetProfile, split_name
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, UnreachableError
-from cotarget.estimation.zoom_matching import CloseupFinder, Expected, MatchingSettings, ZoomMeasurement
+from cotarget.estimation.zoom_matching import GATE, CloseupFinder, Expected, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.pantilt import HeadGeometry
@@ -217,7 +217,7 @@ class TruthFinder:
         )
         off = at - view.center_px
         inside = (at >= 0).all() and (at <= np.array(frame.image.shape[1::-1]) - 1).all()
-        if not inside or off @ np.linalg.solve(view.covariance, off) > MatchingSettings.gate_sigmas**2:
+        if not inside or off @ np.linalg.solve(view.covariance, off) > GATE:
             return None
         return ZoomMeasurement(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), 1.0, 1.0, np.ptp(box, axis=0), frame.t)
 

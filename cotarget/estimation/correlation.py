@@ -5,7 +5,6 @@ object registration in the Fourier domain*, 2012, with weights in place of the t
 """
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,28 +15,11 @@ Samples = np.ndarray  # float32, (H, W) or (H, W, 3)
 # Noise variance of one sample, all three colours together. It keeps a flat patch from correlating with every other flat
 # patch. Where 10 grey levels are one unit, a sensor's noise of 2 levels in each colour leaves about as much.
 NOISE_VARIANCE = 0.1
-# Least sum of weights, the rounding error of float32 sums of some 10^4 terms.
-LEAST_WEIGHT = 1e-3
-# Least curvature of a maximum; flatter ones are not interpolated further.
-FLAT = 1e-6
 
 
-@dataclass(frozen=True)
-class Likeness:
-    """Correlation of a template at each place of its top-left sample, (H - h + 1, W - w + 1) each.
-
-    Attributes:
-        score: normalised correlation, -1 to 1.
-        gain: contrast of the image over that of the template.
-        seen: part of the template's weight inside the image, 0 to 1.
-    """
-
-    score: np.ndarray
-    gain: np.ndarray
-    seen: np.ndarray
-
-
-def correlate(image: Samples, inside: Samples | None, template: Samples, weight: Samples) -> Likeness:
+def correlate(
+    image: Samples, inside: Samples | None, template: Samples, weight: Samples
+) -> tuple[np.ndarray, np.ndarray]:
     """Correlate a weighted template with an image at every place.
 
     Args:
@@ -45,6 +27,10 @@ def correlate(image: Samples, inside: Samples | None, template: Samples, weight:
         inside: 1 where the image is valid and 0 elsewhere, (H, W) float32; None if all of it is valid.
         template: template, (h, w, 3) float32.
         weight: weight of each sample of the template, 0 to 1, (h, w) float32.
+
+    Returns:
+        For each place of the template's top-left sample, (H - h + 1, W - w + 1) each: the normalised correlation, -1 to
+        1, and the part of the template's weight inside the image, 0 to 1.
     """
     mean = np.einsum("ij,ijk->k", weight, template) / weight.sum()
     template = template - mean.astype(np.float32)
@@ -57,7 +43,7 @@ def correlate(image: Samples, inside: Samples | None, template: Samples, weight:
         template_variance: np.ndarray | np.float32 = squared.sum()
     else:
         image = image * inside[..., None]
-        n = np.maximum(_slide(inside, weight), LEAST_WEIGHT)
+        n = np.maximum(_slide(inside, weight), np.finfo(np.float32).eps)
         template_sums = [_slide(inside, plane) for plane in cv2.split(weighted)]
         template_variance = _slide(inside, squared)
     covariance = _slide(image, weighted)
@@ -68,10 +54,8 @@ def correlate(image: Samples, inside: Samples | None, template: Samples, weight:
         variance = variance - image_sum**2 / n
         template_variance = template_variance - template_sum**2 / n
     noise = NOISE_VARIANCE * n
-    own = np.maximum(template_variance, 0.0) + noise
-    score = covariance / np.sqrt(own * (np.maximum(variance, 0.0) + noise))
-    seen = np.broadcast_to(n / weight.sum(), score.shape)
-    return Likeness(score, covariance / own, seen)
+    score = covariance / np.sqrt((np.maximum(template_variance, 0.0) + noise) * (np.maximum(variance, 0.0) + noise))
+    return score, np.broadcast_to(n / weight.sum(), score.shape)
 
 
 def summit(score: np.ndarray, at: tuple[int, int]) -> Array | None:
@@ -95,7 +79,7 @@ def summit(score: np.ndarray, at: tuple[int, int]) -> Array | None:
         return None
     before = np.array([score[y, x - 1], score[y - 1, x]], dtype=float)
     after = np.array([score[y, x + 1], score[y + 1, x]], dtype=float)
-    curvature = np.maximum(2 * float(score[y, x]) - before - after, FLAT)
+    curvature = np.maximum(2 * float(score[y, x]) - before - after, np.finfo(float).eps)
     return np.array([x, y]) + 0.5 * (after - before) / curvature
 
 

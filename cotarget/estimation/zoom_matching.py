@@ -8,7 +8,6 @@ place counts only if it leads the next best one. The source of the numbers: docs
 import math
 from collections import deque
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Protocol
 
 import cv2
@@ -18,18 +17,15 @@ import numpy.typing as npt
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.detection import Detection
-from cotarget.estimation.correlation import Likeness, Samples, correlate, resample, summit
+from cotarget.estimation.correlation import Samples, correlate, resample, summit
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
-# Fewest pixels from which a background's colours are computed.
-LEAST_BACKGROUND = 12
-# Standard deviation of the body's centre along u and v, in parts of the box's sides, measured on simulated targets: of
-# the box alone, of upright bodies (median of the foreground across), of others (median both ways), and of templates.
-BOX_SIGMA = np.array([0.08, 0.18])
-UPRIGHT_SIGMA = np.array([0.03, 0.006])
-OUTLINE_SIGMA = np.array([0.05, 0.12])
-TEMPLATE_SIGMA = np.array([0.01, 0.01])
+# Gate on squared distances in standard deviations.
+GATE = 3.0**2
+# Standard deviation of the body's centre along u and v, in parts of the box's sides, by the target profile's matcher:
+# measured on simulated targets. It is that of the box itself (None) where the outline is not known.
+BODY_SIGMA = {"box": (0.01, 0.01), "upright": (0.03, 0.006), "outline": (0.05, 0.12), None: (0.08, 0.18)}
 # Step for derivatives, in parts of the depth.
 STEP = 1e-3
 Pixels = npt.NDArray[np.bool_]
@@ -40,86 +36,47 @@ class MatchingSettings:
     """Settings of the registration in the zoom image.
 
     Attributes:
-        margin: margin around the target's box that counts, as a part of its larger side ...
-        least_margin_px: ... and at least this many pixels [px].
-        margin_weight: weight of the margin: it shows the outline, but its background appears displaced in the other
-            camera.
-        rim_weight: weight of the pixels at the outline: they are partly the target's, and missing from the foreground
-            half of the time.
+        margin: margin around the target's box that counts, as a part of its larger side.
+        margin_weight: weight of the box's pixels that are not the target's, which falls to 0 across the margin: they
+            show its outline, but the background appears displaced in the other camera.
         foreground: parts of the box that a usable foreground fills: less is none, and more shows the place but not the
             outline. Otherwise the pixels whose colour differs from the surroundings are used, or else an ellipse.
-        stands_out: from this many standard deviations of the surroundings' colours a pixel differs from them.
         least_spread: least standard deviation of the background's colours [grey levels].
-        gate_sigmas: the search covers this many standard deviations around the expected place.
         coarse_samples: samples along the target's larger side, for the whole search.
         fine_samples: the same around the coarse result.
-        finest: most samples per pixel of the fixed image, which holds no more detail.
         widest_search: largest search to each side, in coarse samples.
-        fine_search: the same in fine samples, beyond half a coarse one.
         blur_px: blur of the fixed camera's lens, pixels and coding, one standard deviation; chosen on rendered books
             [px].
         least_lead: least lead of the best place over the next best.
         least_seen: least part of the target inside the zoom image.
-        gain: range of the contrast in the zoom image over that in the fixed image.
-        prior_weight: penalty on the score, per squared distance from the expected place in standard deviations.
-        one_place: places closer than this part of the target's box are one place.
-        sigma_px: standard deviation of a registration at the usual lack of likeness, in pixels of the fixed image ...
-        sigma_samples: ... plus in samples; both measured on the simulated targets.
-        usual_lack: usual lack of likeness, 1 - score.
-        least_lack: least lack of likeness that counts.
+        least_score: least normalised correlation of a match.
+        sigma_px: standard deviation of a registration, in pixels of the fixed image and in samples each; measured on
+            the simulated targets.
+        least_sigma_px: least standard deviation of the expected place, from lens, head and frame times [px].
         longest_apart_s: largest time between the two frames of a registration: limbs and wings move [s].
         latest_s: largest delay of one camera's frames against the other's; fixed frames are kept for that long [s].
-        least_sigma_px: least standard deviation of the expected place, from lens, head and frame times [px].
-        sure_score: a match is sure with at least this score ...
-        largest_drop: ... and at most this much below the usual score ...
-        fading: ... which fades by this a second.
-        least_score: a weaker match counts with at least this score ...
-        believed_s: ... this soon after a sure one [s] ...
-        longest_gap_s: ... and this soon after the last match [s] ...
-        steady_px: ... if its offset from the expected place has changed by no more than this many pixels of the fixed
-            image ...
-        steady_of_side: ... plus this part of the box.
     """
 
     margin: float = 0.2
-    least_margin_px: float = 2.0
     margin_weight: float = 0.1
-    rim_weight: float = 0.3
     foreground: tuple[float, float] = (0.15, 0.9)
-    stands_out: float = 3.0
     least_spread: float = 10.0
-    gate_sigmas: float = 3.0
     coarse_samples: float = 14.0
     fine_samples: float = 40.0
-    finest: float = 4.0
     widest_search: int = 48
-    fine_search: int = 1
     blur_px: float = 0.7
     least_lead: float = 0.12
     least_seen: float = 0.6
-    gain: tuple[float, float] = (0.25, 4.0)
-    prior_weight: float = 0.01
-    one_place: float = 0.5
+    least_score: float = 0.6
     sigma_px: float = 0.08
-    sigma_samples: float = 0.08
-    usual_lack: float = 0.1
-    least_lack: float = 0.04
+    least_sigma_px: float = 1.0
     longest_apart_s: float = 0.1
     latest_s: float = 0.5
-    least_sigma_px: float = 1.0
-    sure_score: float = 0.7
-    largest_drop: float = 0.15
-    fading: float = 0.1
-    least_score: float = 0.55
-    believed_s: float = 0.5
-    longest_gap_s: float = 0.15
-    steady_px: float = 0.5
-    steady_of_side: float = 0.15
 
 
 @dataclass(frozen=True, eq=False)
 class FixedView:
-    """The target as one fixed-camera frame shows it; derived images are computed on demand.
+    """The target as one fixed-camera frame shows it.
 
     Attributes:
         t: exposure time [s].
@@ -128,9 +85,9 @@ class FixedView:
         size_px: width and height of the bounding box, (2,).
         patch: image around the box, (h, w, 3) BGR.
         corner_px: the patch's top-left pixel in the frame (u, v), (2,).
-        foreground: whether each pixel of the patch is the target's, (h, w).
-        outside_px: distance of each pixel of the patch from the box, 0 inside it [px], (h, w).
-        settings: settings of the registration.
+        weight: weight of each pixel of the patch, 0 to 1, (h, w).
+        whitening: colour transform that gives the background unit variance in every direction of colour, (3, 3). The
+            background's own texture then counts for little.
     """
 
     t: float
@@ -139,34 +96,13 @@ class FixedView:
     size_px: Array
     patch: Image
     corner_px: Array
-    foreground: Pixels
-    outside_px: Samples
-    settings: MatchingSettings
+    weight: Samples
+    whitening: Array
 
     @property
     def side_px(self) -> float:
         """Larger side of the box [px]."""
         return float(self.size_px.max())
-
-    @cached_property
-    def weight(self) -> Samples:
-        """Weight of each pixel of the patch, 0 to 1, (h, w)."""
-        settings = self.settings
-        around = settings.margin_weight * np.clip(1 - self.outside_px / _margin(self.size_px, settings), 0, 1)
-        return np.maximum(np.where(self.foreground, 1.0, settings.rim_weight * self._grown), around).astype(np.float32)
-
-    @cached_property
-    def whitening(self) -> Array:
-        """Colour transform that gives the background unit variance in every direction of colour, (3, 3).
-
-        The background's own texture then counts for little.
-        """
-        return _whitening(self.patch[self._grown == 0], self.settings)
-
-    @cached_property
-    def _grown(self) -> Image:
-        """Foreground dilated by its rim, 1 or 0, (h, w)."""
-        return cv2.dilate(self.foreground.astype(np.uint8), np.ones((3, 3), np.uint8))
 
     def at_pitch(self, pitch_px: float) -> tuple[Samples, Samples, Array]:
         """Resample patch and weights every ``pitch_px`` pixels of the fixed image, around the body's centre.
@@ -205,7 +141,7 @@ def look(
     center, size = np.asarray(detection.center_px, dtype=float), np.maximum(detection.size_px, 1.0)
     if not (np.isfinite(center).all() and np.isfinite(size).all()):
         return None
-    margin = _margin(size, settings)
+    margin = settings.margin * size.max()
     limit = np.array(frame.image.shape[1::-1])
     low = np.maximum(np.floor(center - size / 2 - margin).astype(int), 0)
     high = np.minimum(np.ceil(center + size / 2 + margin).astype(int) + 1, limit)
@@ -214,22 +150,26 @@ def look(
     here = slice(low[1], high[1]), slice(low[0], high[0])
     patch = frame.image[here].copy()
     u, v = (np.arange(first, last, dtype=np.float32) for first, last in zip(low, high, strict=True))
-    beyond = np.abs(u - center[0]) - size[0] / 2, np.abs(v - center[1])[:, None] - size[1] / 2
-    outside = np.maximum(np.maximum(*beyond), 0)
-    in_box = outside == 0
+    du, dv = 2 * np.abs(u - center[0]) / size[0], 2 * np.abs(v - center[1])[:, None] / size[1]
+    in_box = np.maximum(du, dv) <= 1
     if not in_box.any():
         return None
+    background = patch[~in_box]
+    whitening = _whitening(background, settings)
     foreground = np.zeros_like(in_box) if mask is None else (mask[here] > 0) & in_box
-    if not _is_outline(foreground, in_box, settings):
-        foreground = _stands_out(patch, in_box, settings)
+    if not _is_outline(foreground, in_box, settings) and len(background):
+        away = (patch - np.median(background, axis=0)) @ whitening
+        foreground = (np.sum(away**2, axis=2) > GATE) & in_box
     is_outline = _is_outline(foreground, in_box, settings)
     body, sigma = _body(target, center, size, (u, v), foreground if is_outline else None)
     if not is_outline:
-        du, dv = (2 * (each + side / 2) / side for each, side in zip(beyond, size, strict=True))
         foreground = du**2 + dv**2 <= 1
     if detection.clipped:  # the hidden part may be as large again
         sigma = np.hypot(sigma, size / 2)
-    return FixedView(frame.t, body, sigma, size, patch, low.astype(float), foreground, outside, settings)
+    du, dv = np.abs(u - center[0]) - size[0] / 2, np.abs(v - center[1])[:, None] - size[1] / 2
+    around = np.clip(1 - np.maximum(du, dv) / margin, 0, 1)  # falls to 0 at the patch's border
+    weight = np.where(foreground, 1.0, settings.margin_weight * around).astype(np.float32)
+    return FixedView(frame.t, body, sigma, size, patch, low.astype(float), weight, whitening)
 
 
 def _body(
@@ -244,20 +184,13 @@ def _body(
         pixels: u of the patch's columns and v of its rows [px].
         outline: whether each pixel of the patch is the target's, (h, w); None if that is not known.
     """
-    if target.matcher == "box":
-        return center, TEMPLATE_SIGMA * size
-    if outline is None:
-        return center, BOX_SIGMA * size
+    known = target.matcher == "box" or outline is not None
+    sigma = np.array(BODY_SIGMA[target.matcher if known else None]) * size
+    if target.matcher == "box" or outline is None:
+        return center, sigma
     (u, v), (rows, columns) = pixels, outline.nonzero()
-    middle = np.array([np.median(u[columns]), np.median(v[rows])], dtype=float)
-    if target.matcher == "upright":
-        return np.array([middle[0], center[1]]), UPRIGHT_SIGMA * size
-    return middle, OUTLINE_SIGMA * size
-
-
-def _margin(size: Array, settings: MatchingSettings) -> float:
-    """Width of the margin around a box of a given size [px]."""
-    return max(settings.least_margin_px, settings.margin * float(size.max()))
+    across = float(np.median(u[columns]))
+    return np.array([across, center[1] if target.matcher == "upright" else np.median(v[rows])], dtype=float), sigma
 
 
 def _is_outline(foreground: Pixels, in_box: Pixels, settings: MatchingSettings) -> bool:
@@ -267,18 +200,9 @@ def _is_outline(foreground: Pixels, in_box: Pixels, settings: MatchingSettings) 
     return bool(least < part < most)
 
 
-def _stands_out(patch: Image, in_box: Pixels, settings: MatchingSettings) -> Pixels:
-    """Mark the pixels of the box whose colour differs from the surroundings."""
-    background = patch[~in_box]
-    if len(background) < LEAST_BACKGROUND or np.ptp(patch) == 0:
-        return np.zeros_like(in_box)
-    away = (patch - np.median(background, axis=0)) @ _whitening(background, settings)
-    return np.asarray((np.sum(away**2, axis=2) > settings.stands_out**2) & in_box)
-
-
 def _whitening(background: Image, settings: MatchingSettings) -> Array:
     """Compute the transform, (3, 3), that whitens background colours (n, 3)."""
-    if len(background) < LEAST_BACKGROUND:
+    if len(background) < 2:
         return np.eye(3) / settings.least_spread
     variances, directions = np.linalg.eigh(np.cov(background.T) + settings.least_spread**2 * np.eye(3))
     return (directions / np.sqrt(variances)) @ directions.T
@@ -323,103 +247,84 @@ class Place:
     score: float
     lead: float
     seen: float
-    sigma_px: float = math.nan
+    sigma_px: float
 
 
-def register(image: Image, fixed_view: FixedView, view: ZoomView) -> Place | None:
+def register(image: Image, fixed_view: FixedView, view: ZoomView, settings: MatchingSettings) -> Place | None:
     """Find a target's cut-out in a zoom image, first coarsely, then finely.
 
     Args:
         image: zoom image, (H, W, 3) BGR.
         fixed_view: the target in the fixed image.
         view: mapping from the fixed to the zoom image.
+        settings: settings of the registration.
 
     Returns:
         The place; None if nothing correlates, if two places do, or if the maximum lies beyond the gate.
     """
-    settings = fixed_view.settings
-    finest = max(1 / settings.finest, 1 / view.scale)
     coarse, fine = (
-        max(fixed_view.side_px / samples, finest) for samples in (settings.coarse_samples, settings.fine_samples)
+        max(fixed_view.side_px / samples, 1 / view.scale)
+        for samples in (settings.coarse_samples, settings.fine_samples)
     )
-    place = _search(image, fixed_view, view, coarse, view.center_px, None)
+    place = _search(image, fixed_view, view, coarse, None, settings)
     if place is None or place.lead < settings.least_lead:
         return None
-    place = _search(image, fixed_view, view, fine, place.center_px, settings.fine_search + math.ceil(coarse / fine / 2))
-    if place is None:
-        return None
-    lack = max(1 - place.score, settings.least_lack) / settings.usual_lack
-    return replace(place, sigma_px=(settings.sigma_px + settings.sigma_samples * fine) * math.sqrt(lack) * view.scale)
+    return _search(
+        image, fixed_view, replace(view, center_px=place.center_px), fine, math.ceil(coarse / fine / 2), settings
+    )
 
 
 def _search(
-    image: Image, fixed_view: FixedView, view: ZoomView, pitch: float, around_px: Array, reach: int | None
+    image: Image, fixed_view: FixedView, view: ZoomView, pitch: float, reach: int | None, settings: MatchingSettings
 ) -> Place | None:
     """Find the place of highest correlation with a cut-out sampled every ``pitch`` fixed pixels.
 
     Args:
         image: zoom image, (H, W, 3) BGR.
         fixed_view: the target in the fixed image.
-        view: mapping from the fixed to the zoom image.
+        view: mapping from the fixed to the zoom image; the search is around its centre.
         pitch: distance of samples [px of the fixed image].
-        around_px: centre of the search in the zoom image (u, v), (2,).
-        reach: samples to each side; None for the whole gate, which then limits the search.
+        reach: samples to each side in which the maximum is; None for those inside the gate.
+        settings: settings of the registration.
     """
-    settings = fixed_view.settings
     template, weight, middle = fixed_view.at_pitch(pitch)
     step = view.J * pitch  # zoom pixels per sample
     back = np.linalg.inv(step)
     spread = back @ view.covariance @ back.T + np.diag((fixed_view.body_sigma_px / pitch) ** 2)
-    sides = np.full(2, settings.widest_search if reach is None else reach)
     if reach is None:
-        sides = np.minimum(np.ceil(settings.gate_sigmas * np.sqrt(np.diag(spread))).astype(int) + 1, sides)
-    A = np.column_stack([step, around_px - step @ (middle + sides)])
+        sides = np.minimum(np.ceil(np.sqrt(GATE * np.diag(spread))).astype(int), settings.widest_search) + 1
+    else:
+        sides = np.full(2, reach + 1)  # and the neighbours of a maximum
+    first_px = view.center_px - step @ (middle + sides)
     width, height = (np.array(weight.shape[::-1]) + 2 * sides).tolist()
-    samples, inside = resample(image, A, (width, height))
+    samples, inside = resample(image, np.column_stack([step, first_px]), (width, height))
     if pitch < 1:  # blur the zoom samples as the fixed camera does, where the sampling resolves it
         samples = cv2.GaussianBlur(samples, (0, 0), settings.blur_px / pitch)
     mix = fixed_view.whitening
-    likeness = correlate(cv2.transform(samples, mix), inside, cv2.transform(template, mix), weight)
-    v, u = np.mgrid[-sides[1] : sides[1] + 1, -sides[0] : sides[0] + 1]
-    inverse = np.linalg.inv(spread)
-    distance = inverse[0, 0] * u * u + 2 * inverse[0, 1] * u * v + inverse[1, 1] * v * v
-    if reach is not None:
-        distance = np.zeros_like(distance)
-    apart = settings.one_place * fixed_view.size_px / pitch
-    return _best(likeness, distance, apart, around_px - step @ sides, step, settings)
-
-
-def _best(
-    likeness: Likeness, distance: Array, apart: Array, origin_px: Array, step: Array, settings: MatchingSettings
-) -> Place | None:
-    """Choose the best place of a search; None if it is out of bounds or no maximum.
-
-    Args:
-        likeness: correlation at every place.
-        distance: squared distance of every place from the expected one, in standard deviations.
-        apart: least distance of two distinct places along u and v, (2,) [samples].
-        origin_px: first place of the search in the zoom image (u, v), (2,).
-        step: from one place to the next, (2, 2) [px].
-        settings: settings of the registration.
-    """
-    lowest, highest = settings.gain
-    allowed = (likeness.gain > lowest) & (likeness.gain < highest)
-    allowed &= (likeness.seen >= settings.least_seen) & (distance <= settings.gate_sigmas**2)
-    score = np.where(allowed, likeness.score - settings.prior_weight * distance, -1.0)
+    likeness, seen = correlate(cv2.transform(samples, mix), inside, cv2.transform(template, mix), weight)
+    allowed = seen >= settings.least_seen
+    if reach is None:
+        v, u = np.mgrid[-sides[1] : sides[1] + 1, -sides[0] : sides[0] + 1]
+        off = np.stack([u, v], axis=-1)
+        allowed &= np.einsum("ijk,kl,ijl->ij", off, np.linalg.inv(spread), off) <= GATE
+    score = np.where(allowed, likeness, -1.0)
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(score)), score.shape))
-    # The prior may have moved the best place by one sample. A score that still rises beyond the gate is another object.
-    top = summit(likeness.score, (row, column))
+    # A score that still rises beyond the gate is another object.
+    top = summit(likeness, (row, column))
     if not allowed[row, column] or top is None:
         return None
+    # Places whose boxes overlap are one place.
+    apart = fixed_view.size_px / pitch
     low = np.maximum(np.ceil([column - apart[0], row - apart[1]]), 0).astype(int)
     high = np.floor([column + apart[0], row + apart[1]]).astype(int) + 1
-    best = float(score[row, column])
     score[low[1] : high[1], low[0] : high[0]] = -1.0
+    best = float(likeness[row, column])
     return Place(
-        center_px=origin_px + step @ top,
-        score=float(likeness.score[row, column]),
+        center_px=first_px + step @ (middle + top),
+        score=best,
         lead=best - max(float(score.max()), 0.0),
-        seen=float(likeness.seen[row, column]),
+        seen=float(seen[row, column]),
+        sigma_px=settings.sigma_px * (1 + pitch) * view.scale,
     )
 
 
@@ -498,9 +403,6 @@ class CloseupFinder:
         calibration.zoom_head.hand_eye()  # raises without T
         self._target, self._settings = target, settings
         self._fixed_views: deque[FixedView] = deque()
-        self._usual_score, self._sure_t = 0.0, -math.inf
-        self._last_t = -math.inf
-        self._last_offset: Array = np.zeros(2)  # from the expected place, in pixels of the fixed image
 
     def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
         """Store the target as a fixed-camera frame shows it.
@@ -523,8 +425,11 @@ class CloseupFinder:
 
     def fixed_view_at(self, t: float) -> FixedView | None:
         """Return the stored cut-out nearest to time t [s]; None if none is within `longest_apart_s`."""
-        near = min(self._fixed_views, key=lambda fixed_view: abs(fixed_view.t - t), default=None)
-        return None if near is None or abs(near.t - t) > self._settings.longest_apart_s else near
+        near, apart_s = None, self._settings.longest_apart_s
+        for fixed_view in reversed(self._fixed_views):  # the newest first
+            if abs(fixed_view.t - t) <= apart_s:
+                near, apart_s = fixed_view, abs(fixed_view.t - t)
+        return near
 
     def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
         """Find the target in a zoom frame.
@@ -539,8 +444,8 @@ class CloseupFinder:
         fixed_view, view = self.fixed_view_at(frame.t), self.view(expected)
         if fixed_view is None or view is None:
             return None
-        place = register(frame.image, fixed_view, view)
-        if place is None or not self._accepts(place, fixed_view, view, frame.t):
+        place = register(frame.image, fixed_view, view, self._settings)
+        if place is None or place.score < self._settings.least_score:
             return None
         return ZoomMeasurement(
             center_px=place.center_px,
@@ -551,22 +456,6 @@ class CloseupFinder:
             size_px=np.linalg.norm(view.J, axis=0) * fixed_view.size_px,
             t=frame.t,
         )
-
-    def _accepts(self, place: Place, fixed_view: FixedView, view: ZoomView, t: float) -> bool:
-        """Decide whether a match is sure, or weaker but continuous with the last ones; store it if so."""
-        offset = np.asarray(np.linalg.solve(view.J, place.center_px - view.center_px), dtype=float)
-        settings = self._settings
-        usual = self._usual_score - settings.fading * abs(t - self._sure_t)
-        if place.score >= max(settings.sure_score, usual - settings.largest_drop):
-            self._usual_score, self._sure_t = max(place.score, usual), t
-        else:
-            recent = abs(t - self._sure_t) <= settings.believed_s and abs(t - self._last_t) <= settings.longest_gap_s
-            most = settings.steady_px + settings.steady_of_side * fixed_view.side_px
-            steady = np.linalg.norm(offset - self._last_offset) <= most
-            if not (place.score >= settings.least_score and recent and steady):
-                return False
-        self._last_t, self._last_offset = t, offset
-        return True
 
     def view(self, expected: Expected) -> ZoomView | None:
         """Map the surroundings of the target to the zoom image; None behind a camera or outside its lens model."""
