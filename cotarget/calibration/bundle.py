@@ -33,8 +33,8 @@ from cotarget.pantilt import HeadGeometry
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 
 Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "warp", "k3", "scale", "zero"]
-# Blocks that a calibration fits by default, in the order of the parameters. "k3" is the fixed camera's; "scale" and
-# "zero" are the encoders'.
+# Blocks that a calibration fits by default, in the parameters' order. "k3" is the fixed camera's; "scale" and "zero"
+# are the encoders'.
 ALL_BLOCKS: tuple[Block, ...] = ("fixed", "zoom", "pupil", "gamma", "hand", "head", "warp")
 EVERY_BLOCK: tuple[Block, ...] = (*ALL_BLOCKS, "k3", "scale", "zero")
 # The order of OpenCV's Jacobian after the pose. k3, the next, is a block by itself: most lenses do not need it, and it
@@ -53,7 +53,7 @@ HEAD_NAMES = {
 @lru_cache
 def block_names(stops: int) -> dict[Block, list[str]]:
     """Name the parameters of every block, in their order, for a lens of ``stops`` zoom samples; see `Covariance`."""
-    names: dict[Block, list[str]] = {
+    return {
         "fixed": [f"fixed.{name}" for name in LENS_NAMES],
         "zoom": [f"zoom[{i}].{name}" for i in range(stops) for name in LENS_NAMES],
         "pupil": [f"zoom[{i}].pupil" for i in range(1, stops)],
@@ -65,7 +65,6 @@ def block_names(stops: int) -> dict[Block, list[str]]:
         "scale": [f"head.{name}" for name in HEAD_NAMES["scale"]],
         "zero": [f"head.{name}" for name in HEAD_NAMES["zero"]],
     }
-    return names
 
 
 def parameter_names(free: Collection[Block], stops: int = 1) -> tuple[str, ...]:
@@ -334,8 +333,7 @@ def _bulge(points: Array) -> Array:
 def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Array, Array]:
     """Compute T_base_head of reported pan and tilt [rad], (v,) each (Eq. 8 with dz and eps).
 
-    Returns:
-        Rotations (v, 3, 3) and translations (v, 3) of T_base_head, and the rotations of tilt alone (v, 3, 3).
+    Returns its rotations (v, 3, 3) and translations (v, 3), and the rotations of tilt alone (v, 3, 3).
     """
     pan, tilt = head.true_angles(pan, tilt)
     turns = Rotation.from_rotvec(pan[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
@@ -406,13 +404,13 @@ Gram = tuple[npt.NDArray[np.intp], Array]
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations in blocks."""
+    """Normal equations in blocks: the n shared parameters, and the poses of B boards."""
 
-    shared: Array  # shared parameters, (n, n)
+    shared: Array  # (n, n)
     mixed: Array  # shared parameters by each board's pose, (B, n, 6)
-    boards: Array  # pose of each board, (B, 6, 6)
-    shared_gradient: Array  # gradient by the shared parameters, (n,)
-    board_gradient: Array  # gradient by each board's pose, (B, 6)
+    boards: Array  # (B, 6, 6)
+    shared_gradient: Array  # (n,)
+    board_gradient: Array  # (B, 6)
     squares: float  # weighted sum of squared residuals [px^2]
 
 
@@ -420,8 +418,8 @@ class Equations:
 class Evaluation:
     """A model's residuals, batch by batch."""
 
-    model: BundleModel  # the model
-    predictions: list[Prediction]  # predicted corners of each batch
+    model: BundleModel
+    predictions: list[Prediction]
     residuals: list[Array]  # predicted minus observed, (v, N, 2) [px]; 0 for corners that are not seen
     after: list[Array]  # residuals after each view's pan and tilt are fitted within the jitter, (v, N, 2) [px]
     given: float  # sum of the squared changes of pan and tilt [rad^2]
@@ -433,10 +431,10 @@ class Evaluation:
 class Problem:
     """Least-squares problem of one fit."""
 
-    batches: list[Batch]  # views, grouped by lens
+    batches: list[Batch]
     points: Array  # the board's corners in its frame [m], (N, 3)
-    free: tuple[Block, ...]  # blocks that are free
-    prior: Prior | None  # prior of the shared parameters, or None
+    free: tuple[Block, ...]
+    prior: Prior | None
     jitter: float  # standard deviation of the head's true angles about the reported ones [rad]
 
     def at(self, model: BundleModel) -> Evaluation:
@@ -456,7 +454,7 @@ class Problem:
                 if p.by_turn is None:
                     after.append(r)
                     continue
-                Q = masked(p.by_turn, batch).reshape(len(r), -1, TURNS)
+                Q = by_turns(p, batch)
                 QT = Q.swapaxes(1, 2)
                 turned = -np.linalg.solve(QT @ Q + penalty * np.eye(TURNS), QT @ r.reshape(len(r), -1, 1))
                 after.append(r + (Q @ turned).reshape(r.shape))
@@ -482,22 +480,18 @@ class Problem:
         n = len(parameter_names(self.free, here.model.stops))
         parameters = float(n + POSE_PARAMETERS * len(here.model.boards))
         if self.jitter:
-            penalty = (here.sigma / self.jitter) ** 2
+            prior = (here.sigma / self.jitter) ** 2 * np.eye(TURNS)
             for batch, p in zip(self.batches, here.predictions, strict=True):
                 if p.by_turn is not None:
-                    Q = masked(p.by_turn, batch).reshape(len(batch.rows), -1, TURNS)
+                    Q = by_turns(p, batch)
                     QTQ = Q.swapaxes(1, 2) @ Q
-                    parameters += float(
-                        np.trace(np.linalg.solve(QTQ + penalty * np.eye(TURNS), QTQ), axis1=1, axis2=2).sum()
-                    )
+                    parameters += float(np.trace(np.linalg.solve(QTQ + prior, QTQ), axis1=1, axis2=2).sum())
         return coordinate_variance(self._seen(here.after), parameters)
 
     def equations(self, here: Evaluation, scale: float | None) -> Equations:
         """Form the normal equations with Huber's weights; with ``scale`` None, those of plain least squares."""
-        sigma = here.sigma
-        return self.assembled(
-            here, self.grams(here, scale), (sigma / self.jitter) ** 2 if self.jitter else np.inf, sigma**2
-        )
+        penalty = (here.sigma / self.jitter) ** 2 if self.jitter else np.inf
+        return self.assembled(here, self.grams(here, scale), penalty)
 
     def grams(self, here: Evaluation, scale: float | None) -> list[Gram]:
         """Compute J^T W J with J = (shared, board, turn, residual) for each view, batch by batch."""
@@ -512,13 +506,10 @@ class Problem:
             found.append((p.columns, J.swapaxes(1, 2) @ J))
         return found
 
-    def assembled(
-        self, here: Evaluation, grams: list[Gram], penalty: float, variance: float | None = None
-    ) -> Equations:
+    def assembled(self, here: Evaluation, grams: list[Gram], penalty: float) -> Equations:
         """Add up all views and the prior, with each view's own pan and tilt eliminated.
 
         The penalty is the variance of a coordinate over the squared jitter [px^2/rad^2], infinite for an exact head.
-        The variance [px^2] weighs the prior; None takes that of the evaluation.
         """
         boards = len(here.model.boards)
         n = len(parameter_names(self.free, here.model.stops))
@@ -539,7 +530,7 @@ class Problem:
             np.add.at(board_gradient, batch.owners, gram[:, b, -1])
             squares += float(gram[:, -1, -1].sum())
         if self.prior is not None:
-            off, information = self._known(here.model, here.sigma**2 if variance is None else variance)
+            off, information = self._known(here.model, here.sigma**2)
             shared += np.diag(information)
             shared_gradient += information * off
             squares += float(off @ (information * off))
@@ -562,6 +553,12 @@ def masked(J: Array, batch: Batch) -> Array:
     return np.where(batch.seen[..., None, None], J, 0.0)
 
 
+def by_turns(prediction: Prediction, batch: Batch) -> Array:
+    """Stack the derivatives by each view's true pan and tilt over its corners, (v, 2 N, 2)."""
+    assert prediction.by_turn is not None
+    return masked(prediction.by_turn, batch).reshape(len(batch.rows), -1, TURNS)
+
+
 def without_turns(gram: Array, penalty: float) -> Array:
     """Eliminate each view's own pan and tilt, the two columns before the last (Schur complement)."""
     k = gram.shape[-1] - 1 - TURNS
@@ -577,8 +574,7 @@ def without_turns(gram: Array, penalty: float) -> Array:
 def reduced(equations: Equations, damping: float) -> tuple[Array, Array, Array]:
     """Eliminate the boards' poses (Schur complement).
 
-    Returns:
-        Normal matrix (n, n) and gradient (n,) of the shared parameters; inverses of the boards' blocks (B, 6, 6).
+    Returns the normal matrix (n, n) and gradient (n,) of the shared parameters, and the boards' inverses (B, 6, 6).
     """
     e = equations
     inverse = np.asarray(np.linalg.inv(e.boards + damped(e.boards, damping)), dtype=float)
@@ -673,7 +669,7 @@ DAMPING_LIMIT = 1e10
 class Fit:
     """Result of a fit."""
 
-    model: BundleModel  # the fitted model
+    model: BundleModel
     free: tuple[Block, ...]  # blocks that were free
     residuals: Array  # predicted minus observed corners, (V, N, 2) [px]; nan for corners that are not seen
     left: Array  # residuals after each view's pan and tilt are fitted within the jitter, (V, N, 2) [px]
@@ -701,13 +697,8 @@ def fit(
 ) -> Fit:
     """Fit the free blocks and the boards' poses to the corners of all views (Levenberg-Marquardt).
 
-    Args:
-        model: start of the iteration, with a pose for every board.
-        views: views to fit.
-        points: the board's corners in its frame [m], (N, 3).
-        free: blocks that are free besides the boards' poses.
-        prior: prior of the shared parameters.
-        jitter: standard deviation of the head's true angles about the reported ones, independent for each view [rad].
+    The model is the start, with a pose for every board. The jitter is the standard deviation of the head's true angles
+    about the reported ones, independent for each view [rad].
 
     Raises:
         CalibrationError: there are no views, or a board ends behind a camera.

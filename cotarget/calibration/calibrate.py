@@ -53,10 +53,10 @@ from cotarget.rig import Rig, opened_from
 
 log = logging.getLogger(__name__)
 NO_BOARD = "no whole board of {}x{} corners is seen"
-TWO_BOARDS = "two boards are in this picture; show one"
+TWO_BOARDS = "two boards are in this image; show one"
 GUESSES = 10  # images searched for another size of board when none shows the configured one
 NOT_EXPECTED = "no part of the board is seen where it should be"
-TEACHING_VIEWS = 4  # first views of a zoom sample, after each of which it is fitted again
+LEARNING_VIEWS = 4  # first views of a zoom sample, after each of which it is fitted again
 
 
 def beyond_shortest(name: str, focal_px: float, shortest_px: float) -> Rejected:
@@ -69,12 +69,7 @@ def find_views(
 ) -> tuple[list[View], list[Rejected], dict[CameraName, tuple[int, int]]]:
     """Find the boards in all images of an index; for the sequential method, only at the shortest focal length.
 
-    Returns:
-        Views, images without a usable board, and image size (width, height) of each camera [px].
-
-    Raises:
-        CalibrationError: an image is missing or malformed, none shows a board, or those at the shortest focal length
-            do not determine the rig.
+    Returns the views, the images without a usable board, and each camera's image size (width, height) [px].
     """
     sizes: dict[CameraName, tuple[int, int]] = {}
     views: list[View] = []
@@ -117,12 +112,12 @@ def _why_none(directory: Path, index: CaptureIndex, rejected: Sequence[Rejected]
     board = index.board
     name = f"{board.kind} of {board.corners[0]}x{board.corners[1]} inner corners"
     if two := [one.name for one in rejected if one.reason == TWO_BOARDS]:
-        return f"no picture shows one {name} alone; {TWO_BOARDS}, like {two[0]}"
+        return f"no image shows one {name} alone; {TWO_BOARDS}, like {two[0]}"
     every = max(len(index.captures) // GUESSES, 1)
     for capture in read_images(directory, index.captures[::every]):
         if other := _another_kind(capture, board):
             return other
-    return f"no picture shows a whole {name}; check the board's corners, and that every picture shows all of it"
+    return f"no image shows a whole {name}; check the board's corners, and that every image shows all of it"
 
 
 def _another_kind(capture: Capture, board: BoardConfig) -> str:
@@ -131,7 +126,7 @@ def _another_kind(capture: Capture, board: BoardConfig) -> str:
     if seen is None or seen == board.corners:
         return ""
     return (
-        f"no picture shows a whole chessboard of {board.corners[0]}x{board.corners[1]} inner corners; "
+        f"no image shows a whole chessboard of {board.corners[0]}x{board.corners[1]} inner corners; "
         f"a board of {seen[0]}x{seen[1]} is seen in {capture.source}"
     )
 
@@ -162,17 +157,17 @@ def _find_parts(
                     missed.append((image, view))
                     continue
                 here.append(replace(view, corners_px=corners))
-                if learning and len(here) <= TEACHING_VIEWS:
-                    model = _taught(model, known, here, points)
+                if learning and len(here) <= LEARNING_VIEWS:
+                    model = _with_last_fitted(model, known, here, points)
             if here:
-                model = _taught(model, known, here, points)
+                model = _with_last_fitted(model, known, here, points)
             waiting = missed
         rejected += [Rejected(view.name, NOT_EXPECTED) for _, view in waiting]
         found += here
     return found, rejected
 
 
-def _taught(model: BundleModel, known: Sequence[View], here: Sequence[View], points: Array) -> BundleModel:
+def _with_last_fitted(model: BundleModel, known: Sequence[View], here: Sequence[View], points: Array) -> BundleModel:
     """Fit the last zoom sample of a model to the views at it."""
     numbers = {view.board for view in here}
     fixed = [view for view in known if view.camera == "fixed" and view.board in numbers]
@@ -220,7 +215,7 @@ def calibrate_views(
         raise CalibrationError(f"unknown method '{options.method}'; the methods are: {choices(METHODS)}")
     check_board(board)
     _check_views(views, board)
-    views = _in_canonical_order(views)
+    views = sorted(views, key=_canonical_order)
     nominal = stops_of(views)
     points = board_points(board)
     others: list[Rejected] = []
@@ -262,15 +257,15 @@ def _check_views(views: Sequence[View], board: BoardConfig) -> None:
         if corners.shape != (len(points), 2) or np.isinf(corners).any() or view.seen.sum() < FEWEST_CORNERS:
             raise CalibrationError(
                 f"{view.name}: has not the {len(points)} finite corners of a {columns}x{rows} board, or the "
-                f"{FEWEST_CORNERS} of them that tell its pose"
+                f"{FEWEST_CORNERS} of them that determine its pose"
             )
-        if not tells_pose(view, points):
+        if not determines_pose(view, points):
             raise CalibrationError(
-                f"{view.name}: all corners seen lie on one line, which does not tell the board's pose; leave it out"
+                f"{view.name}: all corners seen lie on one line, which leaves the board's pose open; leave it out"
             )
 
 
-def tells_pose(view: View, points: Array) -> bool:
+def determines_pose(view: View, points: Array) -> bool:
     """Check whether the corners seen determine the board's pose: enough of them, and not all on one line."""
     seen = view.seen
     if np.count_nonzero(seen) < FEWEST_CORNERS:
@@ -279,27 +274,20 @@ def tells_pose(view: View, points: Array) -> bool:
     return all(np.linalg.matrix_rank(at - at.mean(axis=0), tol=tol) > 1 for at, tol in both)
 
 
-def _in_canonical_order(views: Sequence[View]) -> list[View]:
-    """Sort views, so that the rounding of sums does not depend on the order given."""
-
-    def key(view: View) -> tuple[Any, ...]:
-        return view.camera, view.board, view.focal_px or 0.0, view.pan, view.tilt, view.corners_px.tobytes()
-
-    return sorted(views, key=key)
+def _canonical_order(view: View) -> tuple[Any, ...]:
+    """Make a key that sorts views, so that the rounding of sums does not depend on the order given."""
+    return view.camera, view.board, view.focal_px or 0.0, view.pan, view.tilt, view.corners_px.tobytes()
 
 
 def _at_shortest(views: Sequence[View], nominal: Sequence[float]) -> tuple[list[View], list[Rejected]]:
     """Keep the views of the fixed camera, and those of the zoom camera at its shortest nominal focal length."""
-
-    def keep(view: View) -> bool:
-        return view.camera == "fixed" or view.focal_px is None or view.focal_px <= nominal[0] * (1 + SAME_FOCAL)
-
-    left_out = [
-        beyond_shortest(view.name, view.focal_px, nominal[0])
-        for view in views
-        if view.focal_px is not None and not keep(view)
-    ]
-    return [view for view in views if keep(view)], left_out
+    kept, left_out = [], []
+    for view in views:
+        if view.camera == "fixed" or view.focal_px is None or view.focal_px <= nominal[0] * (1 + SAME_FOCAL):
+            kept.append(view)
+        else:
+            left_out.append(beyond_shortest(view.name, view.focal_px, nominal[0]))
+    return kept, left_out
 
 
 def calibrate_captures(
@@ -377,19 +365,12 @@ def _calibrate_images(
 
 
 def _enough_stops(wanted: int, focal_range_px: tuple[float, float]) -> int:
-    """Give the number of zoom samples: as requested, or as many as matching a board across them needs.
-
-    One sample means the shortest focal length alone.
-    """
+    """Choose the number of zoom samples: as requested, or as many as predicting a board across them needs."""
     needed = fewest_stops(*focal_range_px)
     if not 1 < wanted < needed:
         return wanted
-    leap = (focal_range_px[1] / focal_range_px[0]) ** (1 / (wanted - 1))
     log.warning(
-        "%d zoom samples are %.2g times apart, too far to know the board again from one to the next; %d are taken",
-        wanted,
-        leap,
-        needed,
+        "stops: %d zoom samples are too far apart to predict the next from the last; %d are taken", wanted, needed
     )
     return needed
 

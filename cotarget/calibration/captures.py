@@ -75,9 +75,9 @@ LARGEST_ANGLE = 2 * math.pi  # a head stays within one turn to each side [rad]; 
 class CaptureIndex:
     """Content of index.json."""
 
-    board: BoardConfig  # the board in the images
-    pitch_mm: float | None  # pixel size of the zoom camera [mm], or None
-    captures: tuple[Capture, ...]  # captures with the file's name as their source and an empty image
+    board: BoardConfig
+    pitch_mm: float | None  # pixel size of the zoom camera [mm]
+    captures: tuple[Capture, ...]  # with the file's name as their source and an empty image
 
 
 @model
@@ -148,12 +148,7 @@ def write_index(directory: Path, index: CaptureIndex) -> None:
 
 
 def read_index(directory: Path) -> CaptureIndex:
-    """Read index.json.
-
-    Raises:
-        CalibrationError: the file is missing or malformed, or lists an image twice or one that does not exist; the
-            message names the file and the key.
-    """
+    """Read index.json; an error names the file and the key."""
     path = directory / INDEX
     if not directory.is_dir():
         raise CalibrationError(f"{directory}: no such folder; give a folder of captures")
@@ -169,11 +164,7 @@ def read_index(directory: Path) -> CaptureIndex:
 
 
 def read_images(directory: Path, captures: Sequence[Capture]) -> Iterator[Capture]:
-    """Read the images of captures one by one; all images of a camera must have one size.
-
-    Raises:
-        CalibrationError: an image is missing, unreadable, or differs in size from others of its camera.
-    """
+    """Read the images of captures one by one; all images of a camera must have one size."""
     sizes: dict[CameraName, tuple[str, tuple[int, int]]] = {}
     for capture in captures:
         assert capture.source is not None
@@ -189,15 +180,9 @@ def read_images(directory: Path, captures: Sequence[Capture]) -> Iterator[Captur
 
 
 def read_image(path: Path) -> Image:
-    """Read an image as BGR.
-
-    Raises:
-        CalibrationError: the file is missing or is no image.
-    """
+    """Read an image as BGR."""
     try:
         data = path.read_bytes()
-    except FileNotFoundError:
-        raise CalibrationError(f"{path}: no such file") from None
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
@@ -209,11 +194,7 @@ def read_image(path: Path) -> Image:
 def pair_photos(directory: Path, fixed_glob: str, zoom_glob: str) -> tuple[list[Capture], list[str]]:
     """Pair plain photos of two cameras by the last number in their names.
 
-    Returns:
-        Captures with empty images and the number as the placement; and the names of files without a partner.
-
-    Raises:
-        CalibrationError: there is no folder, no file, a file without a number, or two files with the same number.
+    Returns captures with empty images and the number as the placement, and the names of files without a partner.
     """
     if not directory.is_dir():
         raise CalibrationError(f"{directory}: no such folder; give a folder of photos")

@@ -9,8 +9,8 @@ away from the viewer. The square diagonally outside the first corner is black.
 - `find_near` finds a part of a chessboard, as the zoom camera sees it at long focal lengths. The colours alone do not
   show which part, so the corners are numbered by a prediction that is good to a fraction of a square.
 
-In the functions below, ``grey`` is an image (H, W), ``grid`` the column and row of every corner on the board, (N, 2),
-and ``H`` a homography from squares of the board to pixels. Measurements: docs/design-notes.md.
+Here ``grey`` is an image (H, W), ``grid`` the column and row of every corner on the board, (N, 2), and ``H`` a
+homography from squares of the board to pixels. Measurements: docs/design-notes.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -86,10 +86,7 @@ class FoundCorners:
 
 
 def search_near(grey: Image, grid: Array, predicted: Array, look: Look) -> FoundCorners | None:
-    """Search for corners near their predictions (N, 2) [px], correct the predictions by what is found, and repeat.
-
-    None where fewer than six are found, or where they are too close together.
-    """
+    """Search for corners near predictions (N, 2) [px], correct these, and repeat; None where too few are found."""
     H = homography(grid, predicted)
     if H is None:
         return None
@@ -173,10 +170,8 @@ def are_corners(grey: Image, pixels: Array, grid: Array, H: Array, look: Look) -
 def contrast(grey: Image, pixels: Array, grid: Array, H: Array, share: float) -> Array:
     """Compute the contrast between the two bright and the two dark squares around candidate corners (N, 2) [px].
 
-    The squares are sampled at a share of a square from the corner along both axes.
-
-    Returns:
-        Level of the darker bright square less that of the brighter dark one, (N,) [grey levels]; nan for nan pixels.
+    It is the level of the darker bright square less that of the brighter dark one, (N,), nan for nan pixels. The
+    squares are sampled at a share of a square from the corner along both axes.
     """
     diagonals = np.array([[-1, -1], [1, 1], [1, -1], [-1, 1]])  # dark, dark, bright, bright around the first corner
     arms = through(H, grid[:, None] + share * diagonals) - through(H, grid)[:, None]
@@ -188,10 +183,7 @@ def contrast(grey: Image, pixels: Array, grid: Array, H: Array, share: float) ->
 
 
 def goes_on(grey: Image, grid: Array, seen: Mask, H: Array) -> bool:
-    """Check whether corners continue beyond an edge of the board.
-
-    If so, what is seen is another part of the board, or a part of a larger one.
-    """
+    """Check whether corners continue beyond an edge of the board, which then is another part, or of a larger board."""
     usual = np.median(contrast(grey, through(H, grid[seen]), grid[seen], H, PLAIN.inside))
     last_column, last_row = grid.max(axis=0)
     u, v = np.arange(last_column + 1), np.arange(last_row + 1)
@@ -263,12 +255,7 @@ IGNORED_MARGIN, CORRECTION = 0.3, 1.0
 
 
 def find_charuco(grey: Image, board: BoardConfig, *, thorough: bool = True) -> Array | None:
-    """Find the corners of a ChArUco board, whole or in part.
-
-    Returns:
-        Corners row by row, (columns * rows, 2) [px], nan for those not seen; None where fewer than six are seen, or all
-        in one row or column.
-    """
+    """Find the corners of a ChArUco board, whole or in part; see `find_corners`."""
     grid = grid_of(board)
     rough = _by_markers(grey, board, thorough)
     read = np.asarray(np.isfinite(rough).all(axis=1))
@@ -412,10 +399,7 @@ def _pyramid(grey: Image) -> list[Image]:
 
 
 def another_board(image: Image, board: BoardConfig, corners_px: Array) -> bool:
-    """Check whether an image shows a second board of the same kind and size, by the fastest finder alone.
-
-    A large image is searched for a second chessboard at a fraction of its size only, as `find_corners` begins.
-    """
+    """Check whether an image shows a second board of the same kind and size, by the fastest finder alone."""
     grey = _grey(image).copy()
     H = homography(grid_of(board), corners_px)
     if H is None:
@@ -429,11 +413,7 @@ def another_board(image: Image, board: BoardConfig, corners_px: Array) -> bool:
 
 
 def guess_corners(image: Image) -> tuple[int, int] | None:
-    """Guess the counts of inner corners of any chessboard that an image shows, for an error message.
-
-    Returns:
-        Columns and rows, the larger count first; None where no chessboard is surely seen.
-    """
+    """Guess the inner corners of any chessboard in an image, the larger count first; None where none is surely seen."""
     grey = _pyramid(_grey(image))[0]
     ok, _, layout = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER)
     if not ok:

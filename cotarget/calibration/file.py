@@ -6,7 +6,7 @@ covariance (or null); held_out (or null); board and board_warp [m]; provenance; 
 not seen. Lengths are metres. Angles are degrees where people read them, and radians in the views, so that a refit
 starts from exactly the same numbers.
 
-`CalibrationTable` and what is in it describe the keys; `validate` checks them.
+`CalibrationTable` and its parts describe the keys; `validate` checks them.
 """
 
 import dataclasses

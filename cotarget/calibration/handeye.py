@@ -66,12 +66,12 @@ PRIOR = 1 / np.repeat([REGULARIZED_ROTATION, REGULARIZED_POSITION], 3) ** 2
 class HandEyeProblem:
     """Residuals of n motions or poses as functions of stacked transforms, of which X is the first."""
 
-    # function of the transforms; returns residuals (n, 6), rotation [rad] before translation [m], and derivatives
-    # by a step (w, d) of every transform, (n, 6, 6 * transforms)
+    # From the transforms: residuals (n, 6), rotation [rad] before translation [m], and their derivatives by a step
+    # (w, d) of every transform, (n, 6, 6 * transforms).
     residuals: Callable[[RigidTransform], tuple[Array, Array]]
     groups: tuple[int, ...]  # number of the group of each of the six residuals, from 0
-    # function of the transforms, the residuals' standard deviations (6,) and the number of motions or poses used;
-    # returns the diagonal of the normal matrix of X that noise alone would show, (6,), see `spectrum`
+    # From the transforms, the residuals' standard deviations (6,) and the number of motions or poses used: the diagonal
+    # of the normal matrix of X that noise alone would show, (6,), see `spectrum`.
     noise: Callable[[RigidTransform, Array, int], Array]
     independent: int  # number of independent motions
     share: float = 1.0  # independent motions over all motions; the weight of each
@@ -98,13 +98,8 @@ def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> Ha
         X = transforms[0]
         R = X.rotation
         turned = R.apply(B.translation)
-        r = np.concatenate(
-            [
-                (A.rotation.inv() * R * B.rotation * R.inv()).as_rotvec(),
-                A.apply(X.translation) - turned - X.translation,
-            ],
-            axis=1,
-        )
+        rotation = (A.rotation.inv() * R * B.rotation * R.inv()).as_rotvec()
+        r = np.concatenate([rotation, A.apply(X.translation) - turned - X.translation], axis=1)
         J = np.zeros((len(r), 6, 6))
         J[:, :3, :3] = R_A.swapaxes(1, 2) - one  # A^-1 exp(w) = exp(A^-1 w) A^-1
         J[:, 3:, :3] = _cross(turned)
@@ -137,13 +132,8 @@ def pose_problem(
         predicted = X.inv() * hand_inv * Z
         by_d = -(look * X.rotation.inv()).as_matrix()
         by_z = -by_d @ hand_inv.rotation.as_matrix()
-        r = np.concatenate(
-            [
-                look.apply((predicted.rotation * T_camera_board.rotation.inv()).as_rotvec()),
-                look.apply(predicted.translation - T_camera_board.translation),
-            ],
-            axis=1,
-        )
+        rotation = look.apply((predicted.rotation * T_camera_board.rotation.inv()).as_rotvec())
+        r = np.concatenate([rotation, look.apply(predicted.translation - T_camera_board.translation)], axis=1)
         J = np.zeros((n, 6, 1 + boards, 6))
         J[:, :3, 0, :3] = by_d
         J[:, 3:, 0, :3] = -by_d @ _cross(X.rotation.apply(predicted.translation))
@@ -170,10 +160,8 @@ def _turn_to_z(directions: Array) -> Rotation:
     """Compute the smallest rotations that bring vectors (n, 3) onto +z or -z."""
     sign = np.where(directions[:, 2:] < 0, -1.0, 1.0)
     half = directions * sign / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), SMALLEST_SIGMA) + E3
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    return Rotation.from_rotvec(np.pi * E3) * Rotation.from_rotvec(
-        np.pi * half
-    )  # half a turn about half takes one to z
+    half /= np.linalg.norm(half, axis=1, keepdims=True)  # half a turn about it takes the direction to z
+    return Rotation.from_rotvec(np.pi * E3) * Rotation.from_rotvec(np.pi * half)
 
 
 def _cross(v: Array) -> Array:
@@ -214,9 +202,8 @@ def _descend(
 ) -> tuple[RigidTransform, Array, Array]:
     """Iterate Gauss-Newton steps to the optimum.
 
-    Returns:
-        Transforms; standard deviations of the six residuals, (6,); degrees of freedom that the parameters take from
-        each, (6,).
+    Returns the transforms, the standard deviations of the six residuals, and the degrees of freedom that the parameters
+    take from each.
     """
     freedom = np.full(6, float(len(state)))  # taken from each of the six residuals
     for _ in range(ROUNDS):
@@ -241,11 +228,7 @@ def _descend(
 
 
 def _eliminated(N: Array, g: Array) -> tuple[Array, Array, Array]:
-    """Eliminate all transforms but X.
-
-    Returns:
-        Normal matrix (6, 6) and gradient (6,) of X; and Nzz^-1 (Nzx, gz), (p - 6, 7).
-    """
+    """Eliminate all transforms but X: its normal matrix (6, 6) and gradient (6,), and Nzz^-1 (Nzx, gz), (p - 6, 7)."""
     if len(N) == 6:
         return N, g, np.empty((0, 7))
     through = np.asarray(np.linalg.solve(N[6:, 6:], np.column_stack([N[6:, :6], g[6:]])), dtype=float)
@@ -255,11 +238,7 @@ def _eliminated(N: Array, g: Array) -> tuple[Array, Array, Array]:
 def _inverse(
     problem: HandEyeProblem, state: RigidTransform, Nx: Array, sigma: Array, count: int, free: int
 ) -> tuple[Array, Array]:
-    """Invert the normal matrix of X in the directions that are known, and compute the prior's step in the free ones.
-
-    Returns:
-        Covariance of X (6, 6), and the step (6,) towards the smallest rotation and translation.
-    """
+    """Invert the normal matrix of X in the known directions, and compute the prior's step (6,) in the free ones."""
     values, V = spectrum(Nx, problem.share * problem.noise(state, sigma, count))
     known = np.arange(6) >= free if free else values > HOPELESS
     inverse = (V[:, known] / np.maximum(values[known], HOPELESS)) @ V[:, known].T
@@ -372,8 +351,7 @@ def motions(
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
     """Make the motions of head and camera between all pairs of views of one placement (Eq. 3).
 
-    Returns:
-        A: T_head_head' = T_base_head^-1 T_base_head', and B: T_zoom_zoom' = T_zoom_board T_zoom_board'^-1.
+    Returns A, T_head_head' = T_base_head^-1 T_base_head', and B, T_zoom_zoom' = T_zoom_board T_zoom_board'^-1.
     """
     pairs = list(itertools.combinations(range(len(poses_base_head)), 2))
     return (
@@ -383,23 +361,15 @@ def motions(
 
 
 def park_martin(head_motions: Sequence[RigidTransform], camera_motions: Sequence[RigidTransform]) -> RigidTransform:
-    """Solve A_i T = T B_i in closed form (Eqs. 3, 4).
+    """Solve A_i T = T B_i for T, the paper's T_head_zoom, in closed form (Eqs. 3, 4).
 
     A head that counts pan or tilt the other way needs no treatment: it is the same head with its frame turned by half a
     turn. T absorbs that, and the calibration points equally well.
 
-    Args:
-        head_motions: motions A_i of the head.
-        camera_motions: motions B_i of the camera.
-
-    Returns:
-        T_head_zoom, the paper's T.
-
     Raises:
         CalibrationError: the motions are too few, all about one axis, or contradict each other.
     """
-    alpha = _rotvecs(head_motions)
-    beta = _rotvecs(camera_motions)
+    alpha, beta = _rotvecs(head_motions), _rotvecs(camera_motions)
     _check_axes(alpha)
     _check_angles(alpha, beta)
     R = _park_martin_rotation(alpha, beta)
@@ -496,11 +466,7 @@ def solve_hand_eye(
 
 
 def _together(transforms: Sequence[RigidTransform]) -> RigidTransform:
-    """Stack transforms into one scipy RigidTransform.
-
-    Raises:
-        CalibrationError: an item is not a RigidTransform.
-    """
+    """Stack transforms into one scipy RigidTransform, and refuse other items."""
     try:
         return RigidTransform.concatenate(list(transforms))
     except TypeError:
@@ -511,11 +477,7 @@ def _together(transforms: Sequence[RigidTransform]) -> RigidTransform:
 
 
 def _solved(problem: HandEyeProblem, start: RigidTransform, moved: HandMotions, regularize: bool) -> HandEye:
-    """Fit a problem, judge what is determined, and refuse or regularize what is not.
-
-    Raises:
-        CalibrationError: X is undetermined and ``regularize`` is False.
-    """
+    """Fit a problem, judge what is determined, and refuse or regularize what is not."""
     found = fit_motions(problem, start)
     verdict = judge_motions(found.normal, found.noise, moved)
     if not verdict.determined:
@@ -536,11 +498,7 @@ def _solved(problem: HandEyeProblem, start: RigidTransform, moved: HandMotions, 
 
 
 def _start(A: RigidTransform, B: RigidTransform) -> RigidTransform:
-    """Find a first X in closed form, even where the motions leave some of it undetermined.
-
-    Raises:
-        CalibrationError: the motions contradict each other.
-    """
+    """Find a first X in closed form, even where the motions leave some of it undetermined."""
     alpha, beta = A.rotation.as_rotvec(), B.rotation.as_rotvec()
     _check_angles(alpha, beta)
     good = _angles_off(alpha, beta) <= ANGLE_TOLERANCE
@@ -634,8 +592,8 @@ def _check_angles(alpha: Array, beta: Array) -> None:
     if np.median(_angles_off(alpha, beta)) > ANGLE_TOLERANCE:
         i = int(np.argsort(off)[len(off) // 2])
         raise CalibrationError(
-            f"hand-eye: the head says that it turned by {np.degrees(head[i]):.1f} degrees where the zoom camera turned "
-            f"by {np.degrees(camera[i]):.1f}; check the head's units and that the camera is fastened to it"
+            f"hand-eye: the head reports a turn of {np.degrees(head[i]):.1f} degrees where the zoom camera turned by "
+            f"{np.degrees(camera[i]):.1f}; check the head's units and that the camera is fastened to it"
         )
 
 

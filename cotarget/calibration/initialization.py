@@ -42,8 +42,6 @@ def calibrate_camera(
 ) -> tuple[Intrinsics, Fit]:
     """Fit one camera's intrinsics: focal lengths, principal point, k1, k2, p1, p2; every view's pose is free.
 
-    The views are at one focal length. The fit starts from ``start``, or from `rough_intrinsics`.
-
     Raises:
         CalibrationError: too few views, or OpenCV finds no camera that explains them.
     """
@@ -171,14 +169,18 @@ def _misfit(model: BundleModel, number: int, T: RigidTransform, views: Sequence[
 
 # Both cameras, Gamma and T
 
+# Ratio of the rms together to the rms alone, and rms, beyond which two cameras contradict each other, because they did
+# not stand still. Lenses and boards that differ from the model cost less than twice.
+CONTRADICTION, CONTRADICTION_FLOOR_PX = 3.0, 1.0
+
 
 @dataclass(frozen=True, eq=False)
 class Steps:
     """Result of calibrating each camera by itself."""
 
-    model: BundleModel  # model with both cameras' intrinsics
-    fixed_fit: Fit  # fit of the fixed camera
-    zoom_fit: Fit  # fit of the zoom camera
+    model: BundleModel
+    fixed_fit: Fit
+    zoom_fit: Fit
     views: tuple[View, ...]  # views used
     rejected: tuple[Rejected, ...]  # views left out
 
@@ -241,11 +243,6 @@ def check_pairs(steps: Steps, together_px: float) -> None:
         )
 
 
-# Ratio of the rms together to the rms alone, and rms, beyond which two cameras contradict each other, because they did
-# not stand still. Lenses and boards that differ from the model cost less than twice.
-CONTRADICTION, CONTRADICTION_FLOOR_PX = 3.0, 1.0
-
-
 # A view whose typical residual exceeds the floor and this many times its camera's usual one is left out; single wrong
 # corners are left to the last fit.
 OUTLIER_FACTOR = 4.0
@@ -261,11 +258,7 @@ def at_home(view: View) -> bool:
 def one_camera(
     camera: CameraName, views: Sequence[View], points: Array, size: tuple[int, int]
 ) -> tuple[Intrinsics, Fit, tuple[View, ...], list[Rejected]]:
-    """Calibrate one camera from its views alone, without views that do not fit the others.
-
-    Returns:
-        Intrinsics, the fit, the views used, and the views left out.
-    """
+    """Calibrate one camera from its views alone; return also the views used, and those that do not fit the others."""
     mine = tuple(view for view in views if view.camera == camera)
     lens, result = calibrate_camera(camera, mine, points, size)
     typical = np.array([robust_sigma(r[view.seen]) for r, view in zip(result.residuals, mine, strict=True)]) * 2**0.5
@@ -323,9 +316,6 @@ def rough_hand(model: BundleModel, views: Sequence[View], points: Array, *, regu
     """Estimate T from all motions within each placement, by Park and Martin's method.
 
     With ``regularize`` it is the smallest turn and shift where the motions leave T undetermined.
-
-    Raises:
-        CalibrationError: the motions do not determine T, or contradict each other.
     """
     A: list[RigidTransform] = []
     B: list[RigidTransform] = []

@@ -73,7 +73,7 @@ from cotarget.calibration.model import (
 )
 from cotarget.calibration.observability import limits_of_use, name_directions, weak_directions
 from cotarget.calibration.uncertainty import covariance_of, cross_validate, with_consider_covariance
-from cotarget.camera import ZoomLens, distortion_growth
+from cotarget.camera import Intrinsics, ZoomLens, distortion_growth
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
@@ -90,15 +90,11 @@ RELATIVE_ROUNDING = 1e-10  # rounding of a normal matrix after the boards' poses
 
 
 def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> float:
-    """Estimate the standard deviation of the head's angles about the reported ones, by restricted maximum likelihood.
+    """Estimate the head's jitter [rad] by restricted maximum likelihood; 0 where the corners give no evidence of it.
 
     With the variance of the corners profiled out, the likelihood of a jitter needs only the normal equations of the fit
-    without jitter (Patterson and Thompson 1971; Harville 1977).
-
-    The fit may have assumed some jitter already, which affects only the weights of its corners.
-
-    Returns:
-        Standard deviation of each axis [rad]; 0 where the corners give no evidence of jitter.
+    without jitter (Patterson and Thompson 1971; Harville 1977). Jitter that the fit has assumed affects only the
+    weights of its corners.
     """
     problem = Problem(batches_of(found.model, found.views), points, found.free, prior, found.jitter)
     if found.variance is None or not any(batch.stop is not None for batch in problem.batches):
@@ -136,7 +132,7 @@ def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> fl
 def head_turns(found: Fit, points: Array) -> Array:
     """Estimate by how much each zoom view's true pan and tilt differ from the reported ones, (V, 2) [rad].
 
-    The boards and all other parameters stay as fitted. Views of the fixed camera have nan.
+    All else stays as fitted. Views of the fixed camera have nan.
     """
     problem = Problem(batches_of(found.model, found.views), points, (), None, 0.0)
     here = problem.at(found.model)
@@ -205,11 +201,11 @@ def with_stop(lens: ZoomLens, nominal_px: float) -> ZoomLens:
     """
     last = lens.stops[-1]
     magnified = nominal_px / lens.nominal_px[-1]
-    k1, k2, p1, p2, k3 = (float(k) for k in np.array(last.distortion) * distortion_growth(magnified))
-    distortion = (k1, k2, p1, p2, k3)
     focal, center = np.array(last.focal_px) * magnified, np.array(last.center_px)
+    distortion = np.zeros(5)  # one sample does not show how the image's distortion changes with the focal length
     if len(lens.stops) > 1:
         before = lens.stops[-2]
+        distortion = np.array(last.distortion) * distortion_growth(magnified)
         onward = np.log(magnified) / np.log(lens.nominal_px[-1] / lens.nominal_px[-2])
         ratio, earlier = (
             np.array(stop.focal_px) / nominal
@@ -217,14 +213,8 @@ def with_stop(lens: ZoomLens, nominal_px: float) -> ZoomLens:
         )
         focal = focal * (ratio / earlier) ** onward
         center = center + onward * (center - np.array(before.center_px))
-    else:
-        distortion = (0.0,) * 5  # one sample does not show how the image's distortion changes with the focal length
-    guess = replace(
-        last,
-        focal_px=(float(focal[0]), float(focal[1])),
-        center_px=(float(center[0]), float(center[1])),
-        distortion=distortion,
-    )
+    (fx, fy), (cx, cy), (k1, k2, p1, p2, k3) = focal.tolist(), center.tolist(), distortion.tolist()
+    guess = Intrinsics(last.size, (fx, fy), (cx, cy), (k1, k2, p1, p2, k3))
     return ZoomLens((*lens.nominal_px, nominal_px), (*lens.stops, guess), (*lens.pupil, lens.pupil[-1]))
 
 
@@ -245,8 +235,8 @@ def lens_prior(model: BundleModel) -> Prior:
 def fit_stop(model: BundleModel, number: int, views: Sequence[View], points: Array) -> BundleModel:
     """Fit one zoom sample, of which the model has a first guess; every other parameter of the model is held.
 
-    The views are those of the zoom camera at that sample, and of the fixed camera of the same placements. The boards'
-    poses are free during the fit, and are returned as they were.
+    The views are those at that sample, and of the fixed camera of the same placements. The boards' poses are free
+    during the fit, and are returned as they were.
     """
     known = lens_prior(model)
     own = f"zoom[{number}]."  # without a prior the other samples, which have no views here, do not move
@@ -263,10 +253,7 @@ def expected_inside(expected_px: Array, size: tuple[int, int]) -> Array:
 
 
 def find_expected(image: Image, view: View, model: BundleModel, board: BoardConfig) -> Array | None:
-    """Find a board, whole or in part, where a model with its pose expects it; None where it is not found surely.
-
-    The corners of the view are not used.
-    """
+    """Find a board, whole or in part, where a model with its pose expects it; None where it is not found surely."""
     expected_px = predict_pixels(model, [view], board_points(board))[0]
     inside = expected_inside(expected_px, (image.shape[1], image.shape[0]))
     found = None
@@ -287,7 +274,7 @@ def check_stops(model: BundleModel) -> None:
         if b <= a:
             raise CalibrationError(
                 f"zoom lens: the true focal length comes out as {a:.0f} px at {n:.0f} px and {b:.0f} px at {m:.0f} px "
-                "by the device's account; check that the lens stood still and was where it said"
+                "as the device reports them; check that the lens stood still where it reported to be"
             )
 
 
@@ -297,7 +284,7 @@ def check_stops(model: BundleModel) -> None:
 # million so.
 WRONG_SIGMAS, WRONG_FLOOR_PX = 6.0, 0.5
 WRONG_SHARE = 0.3  # a view with a larger share of wrong corners is left out as a whole
-NO_PLACE = "its board is seen by neither camera at the shortest focal length, so that nothing tells where it is"
+NO_PLACE = "its board is seen by neither camera at the shortest focal length, so that its pose is unknown"
 # A view is left out when the head stands this many times farther from the reported angles than usual, and by more than
 # the floor, which allows for the backlash and sag of usual heads.
 ELSEWHERE_SIGMAS, ELSEWHERE_FLOOR = 6.0, np.radians(0.05)
@@ -333,12 +320,7 @@ def joint(
 ) -> Solution:
     """Calibrate a rig by one fit of all parameters.
 
-    Args:
-        views: views of both cameras, those of the zoom camera at any zoom sample.
-        points: the board's corners.
-        sizes: image sizes of both cameras.
-        nominal_px: nominal focal lengths of the zoom samples [px], increasing; empty where the lens reports none.
-        options: options of the calibration.
+    The zoom samples' nominal focal lengths [px] increase; there are none where the lens reports none.
 
     Raises:
         CalibrationError: the views do not determine the rig; the message says what is missing.
@@ -397,12 +379,7 @@ def joint(
 def _uncertainty(
     found: Fit, points: Array, prior: Prior, options: Options
 ) -> tuple[Covariance | None, HeldOut | None, float]:
-    """Compute the covariance of a fit, with the doubt about held parameters.
-
-    Returns:
-        Covariance, or None; result of the held-out check, or None; and the factor by which all standard deviations are
-        widened.
-    """
+    """Compute the covariance of a fit with consider parameters, the held-out check, and the widening by both."""
     widened = K3_WIDENED if "k3" in found.free else 1.0
     covariance = covariance_of(found)
     if covariance is None:
@@ -442,11 +419,7 @@ def _known(
 def _all_stops(
     found: Fit, views: Sequence[View], points: Array, nominal_px: Sequence[float]
 ) -> tuple[BundleModel, list[View], list[Rejected]]:
-    """Add the zoom samples beyond the first in their order, each fitted by itself.
-
-    Returns:
-        Model with the zoom samples; the views used; what was left out.
-    """
+    """Add the zoom samples beyond the first, each fitted by itself; return also the views used and left out."""
     model, used, rejected = found.model, list(found.views), []
     for number, nominal in enumerate(nominal_px[1:], start=1):
         at_stop = [v for v in views if v.camera == "zoom" and stop_of(nominal_px, v) == number]
@@ -468,8 +441,7 @@ def _all_stops(
 def _cleaned(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:
     """Leave out views with a wrong head pose and wrong corners, and estimate the head's jitter.
 
-    Returns:
-        The fit of the rest; the number of single corners left out; the views left out.
+    Returns the fit of the rest, the number of single corners left out, and the views left out.
     """
     found, elsewhere = _without_heads_elsewhere(found, points, prior)
     found, wrong, spoilt = _without_wrong_corners(found, points, prior)
@@ -496,11 +468,7 @@ def _without_heads_elsewhere(found: Fit, points: Array, prior: Prior) -> tuple[F
 
 
 def _without_wrong_corners(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:
-    """Leave out corners with far too large residuals, and estimate the head's jitter.
-
-    Returns:
-        The fit of the rest; the number of single corners left out; the views left out.
-    """
+    """Leave out corners with far too large residuals, and estimate the head's jitter; returns as `_cleaned`."""
     found = _with_jitter(found, points, prior)
     lengths = np.linalg.norm(found.left, axis=-1)
     seen = np.isfinite(lengths)
@@ -540,13 +508,10 @@ def _with_jitter(found: Fit, points: Array, prior: Prior) -> Fit:
 
 
 def _with_k3_where_needed(found: Fit, points: Array, prior: Prior) -> tuple[Fit, Prior]:
-    """Free the fixed camera's k3 where its estimate is significant (`K3_SIGMAS`).
+    """Free the fixed camera's k3 where its estimate is significant (`K3_SIGMAS`); return the fit and its prior.
 
     The variance of its prior is k3^2 less the estimate's variance (empirical Bayes), so that a smaller k3 is drawn
     towards 0.
-
-    Returns:
-        The fit and its prior, as they were where k3 stays held.
     """
     free: tuple[Block, ...] = (*found.free, "k3")
 

@@ -217,13 +217,13 @@ class BundleModel:
 class Solution:
     """Result of a calibration method."""
 
-    model: BundleModel  # fitted model, with the board of every placement
-    residuals: Residuals  # residuals of its parts
+    model: BundleModel
+    residuals: Residuals
     views: tuple[View, ...]  # views that it used
     has_head: bool  # False if the head never moved, so that T is unknown
-    covariance: Covariance | None = None  # covariance of the parameters, or None
+    covariance: Covariance | None = None
     jitter: float = 0.0  # standard deviation of the head's true angles about the reported ones [rad]
-    held_out: HeldOut | None = None  # result of the held-out check, or None
+    held_out: HeldOut | None = None
 
 
 def stop_of(nominal_px: Sequence[float], view: View) -> int:

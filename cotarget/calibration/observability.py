@@ -221,8 +221,7 @@ def _owner(owner: str) -> str:
 def _still(basis: Array, rows: Sequence[int]) -> Array:
     """Select the directions that do not change some parameters; all directions where each changes them.
 
-    With tilt alone, an axis offset equals a shift of T_head_zoom. This selection keeps the verdict on T_head_zoom free
-    of that.
+    With tilt alone, an axis offset equals a shift of T_head_zoom, of which the verdict on T_head_zoom shall be free.
     """
     _, s, Vt = np.linalg.svd(basis[list(rows)])
     rank = int(np.sum(s**2 > TAKES_PART))
@@ -230,12 +229,9 @@ def _still(basis: Array, rows: Sequence[int]) -> Array:
 
 
 def _name_hand(names: Sequence[str], basis: Array) -> tuple[str, list[str], list[str]]:
-    """Describe why T_head_zoom is undetermined.
+    """Describe why T_head_zoom is undetermined, from the free directions' rows (m, k) for parameters with these names.
 
-    The free directions are given by their rows (m, k) for the m parameters with these names.
-
-    Returns:
-        Reason, names of what is undetermined, and what to add.
+    Returns the reason, the names of what is undetermined, and what to add.
     """
     spans = []
     for kind in ("r", "t"):
@@ -256,11 +252,7 @@ def _name_hand(names: Sequence[str], basis: Array) -> tuple[str, list[str], list
 
 
 def _how_it_moved(motions: HandMotions) -> tuple[str, Array | None, str, str]:
-    """Describe the hand's motions.
-
-    Returns:
-        Description; the only axis, (3,), or None where there are several; the axis's name; what to add.
-    """
+    """Describe the hand's motions in words, by their axis (3,) where there is only one, its name, and what to add."""
     turns, shifts = motions.turns, motions.shifts
     largest = float(np.linalg.norm(turns, axis=1).max())
     moves = float(np.linalg.norm(shifts, axis=1).max())

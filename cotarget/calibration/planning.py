@@ -36,8 +36,8 @@ BORDER = 0.02  # border that the grid keeps clear, as a share of the image
 class PredictedAccuracy:
     """Normal matrix of the parameters so far, and the dependence of the pointing error on them."""
 
-    model: BundleModel  # model fitted so far
-    free: tuple[Block, ...]  # its free blocks
+    model: BundleModel
+    free: tuple[Block, ...]
     normal: Array  # normal matrix of the parameters, (n, n) [1/px^2]
     variance: float  # variance of a corner coordinate [px^2]
     pointing: Array  # mean over targets of J^T J, with J the derivative of the pointing error by the parameters, (n, n)
@@ -156,10 +156,8 @@ def visible(
 ) -> tuple[npt.NDArray[np.bool_], Array]:
     """Check which of many board poses show the whole board, facing the camera and large enough for the finders.
 
-    The poses are given as `board_body` in the camera's frame [m], (K, 4 + N, 3).
-
-    Returns:
-        True for visible boards, (K,), and the inner corners (K, N, 2) [px].
+    The poses are given as `board_body` in the camera's frame [m], (K, 4 + N, 3). Returns True for visible boards, (K,),
+    and the inner corners (K, N, 2) [px].
     """
     columns, rows = board.corners
     px = lens.project(x_camera)
@@ -200,11 +198,9 @@ def plan_placements(
 ) -> list[RigidTransform]:
     """Choose a board placement for each distance: of random candidates, the one that adds most to the coverage.
 
-    The whole board is in the fixed image, less a margin; if ``shared`` in the zoom image at home too. A model without
-    zoom camera counts the fixed camera alone.
-
-    Returns:
-        T_fixed_board, one for each distance (a share of the way from near to far) at which a candidate is visible.
+    The distances are shares of the way from near to far; those at which no candidate is visible have no placement. The
+    whole board is in the fixed image, less a margin; if ``shared`` in the zoom image at home too. A model without zoom
+    camera counts the fixed camera alone.
     """
     fixed, head = model.fixed, model.zoom_head
     chosen = []
@@ -250,10 +246,7 @@ def preferred_share(number: int) -> float:
 
 
 def _between(x_fixed: Array, center_fixed: Array) -> Rotation:
-    """Compute half the turn from the fixed camera's line of sight to the zoom camera's, for points (n, 3).
-
-    A board turned so faces both cameras equally.
-    """
+    """Compute half the turn from the fixed camera's line of sight to the zoom camera's, for points (n, 3)."""
     here = x_fixed / np.linalg.norm(x_fixed, axis=-1, keepdims=True)
     there = x_fixed - center_fixed
     there = there / np.linalg.norm(there, axis=-1, keepdims=True)
@@ -274,11 +267,7 @@ def plan_poses(
     rng: np.random.Generator,
     margin_px: float,
 ) -> list[tuple[float, float]]:
-    """Choose head poses that bring a board to parts of the zoom image with few corners so far.
-
-    Returns:
-        Up to ``count`` pairs (pan, tilt) [rad], within the limits.
-    """
+    """Choose up to ``count`` pans and tilts [rad] that bring a board to parts of the zoom image with few corners."""
     head, lens = model.head, model.head.lens.stops[0]
     middle = (head.T_base_fixed * T_fixed_board).apply(board_points(board).mean(axis=0))
     ray = lens.ray(lens.image_center_px)

@@ -42,12 +42,7 @@ OTHER_LENS = 1.25  # ratio of focal lengths beyond which a lens is another one
 
 
 def check_plausible(calibration: Calibration, spec: RigSpec | None = None, *, insist: bool = False) -> None:
-    """Refuse a calibration that no rig has, or that belongs to another rig than the one in use.
-
-    Args:
-        calibration: calibration as it was saved.
-        spec: description of the rig in use; None where there is none.
-        insist: whether to accept it all the same.
+    """Refuse a calibration that no rig has, or that belongs to another rig than the one in use; accept it on insist.
 
     Raises:
         CalibrationError: it is implausible; the message names the key in calibration.json.
@@ -122,18 +117,14 @@ def _contradiction(calibration: Calibration) -> str:
     off = _typical_angle(calibration, model, views)
     if off <= USUAL:
         return ""
-    are_exchanged = BETTER_EXCHANGED * _typical_angle(calibration, _exchanged(model), views) < off
+    exchanged = model.with_zoom_head(T_zoom0_fixed=model.head.hand_eye(), T_head_zoom=model.head.T_zoom0_fixed)
+    are_exchanged = BETTER_EXCHANGED * _typical_angle(calibration, exchanged, views) < off
     if not are_exchanged and off <= UNEXPLAINED:
         return ""
     return (
         f"T_head_zoom, T_zoom0_fixed: they miss the corners that they come from by {math.degrees(off):.2g} degrees; "
         f"{'are they exchanged?' if are_exchanged else 'calibrate again'}"
     )
-
-
-def _exchanged(model: BundleModel) -> BundleModel:
-    """Exchange T and Gamma."""
-    return model.with_zoom_head(T_zoom0_fixed=model.head.hand_eye(), T_head_zoom=model.head.T_zoom0_fixed)
 
 
 def _checked_views(views: Sequence[View]) -> list[View]:

@@ -55,17 +55,8 @@ def with_consider_covariance(
 
     One Gauss-Newton step with the held parameters free gives their estimates and standard deviations. An estimate that
     noise explains adds nothing. Any other is taken as the parameter's error. With S = dp/dq, the sensitivity of the
-    fitted parameters p to an error of a held q, the errors (S, -1) q are added to the covariance.
-
-    Args:
-        covariance: covariance of the fit.
-        found: the fit.
-        points: the board's corners.
-        held: blocks that were held in the fit.
-        prior: prior of the fit and of the held blocks.
-
-    Returns:
-        Covariance of the fit's parameters and of the held ones that are doubted.
+    fitted parameters p to an error of a held q, the errors (S, -1) q are added to the covariance, which then contains
+    these q too. The prior is that of the fit and of the held blocks.
     """
     own = list(covariance.parameters)
     free = (*found.free, *held)
@@ -109,9 +100,7 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
     numbers = sorted({view.board for view in of_both(found.views)})
     if len(numbers) < folds:
         return None
-    misses: list[Array] = []
-    expected: list[Array] = []
-    left: list[Array] = []
+    misses, expected, left = [], [], []
     stop_of = found.model.stop_of
     for k in range(folds):
         out = set(numbers[k::folds])
@@ -162,12 +151,11 @@ def _predicted(found: Fit, covariance: Array, kept: Sequence[View], points: Arra
     assert variance is not None
     fixed = [view for view in kept if view.camera == "fixed"]
     zoom = [view for view in kept if view.camera == "zoom"]
-    told = fit(model, fixed, points, ()).model
-    boards = list(told.boards)
+    placed = fit(model, fixed, points, ()).model
     n = len(parameter_names(found.free, model.stops))
-    by_p, spread = (np.zeros((len(boards), POSE_PARAMETERS, width)) for width in (n, POSE_PARAMETERS))
-    for batch in batches_of(told, fixed):
-        p = predict(told, batch, points, found.free)
+    by_p, spread = (np.zeros((len(placed.boards), POSE_PARAMETERS, width)) for width in (n, POSE_PARAMETERS))
+    for batch in batches_of(placed, fixed):
+        p = predict(placed, batch, points, found.free)
         B = masked(p.by_board, batch).reshape(len(batch.rows), -1, POSE_PARAMETERS)
         J = masked(p.by_shared, batch).reshape(len(batch.rows), B.shape[1], -1)
         inverse = np.linalg.inv(B.swapaxes(1, 2) @ B)
@@ -176,8 +164,8 @@ def _predicted(found: Fit, covariance: Array, kept: Sequence[View], points: Arra
         full[:, :, p.columns] = inverse @ B.swapaxes(1, 2) @ J
         by_p[batch.owners] = full
     misses, covariances = np.empty((len(zoom), 2)), np.empty((len(zoom), 2, 2))
-    for batch in batches_of(told, zoom):
-        p = predict(told, batch, points, found.free)
+    for batch in batches_of(placed, zoom):
+        p = predict(placed, batch, points, found.free)
         G = np.zeros((len(batch.rows), 2, n))
         G[:, :, p.columns] = _mean(p.by_shared, batch)
         Bz = _mean(p.by_board, batch)
@@ -302,10 +290,7 @@ def miss_derivatives(
 ) -> tuple[Array, Array]:
     """Compute the derivatives of the miss m of `line_of_sight_covariance`, by central differences.
 
-    There are n targets, at pixels (n, 2) and depths (n,) [m]. See there for the other arguments.
-
-    Returns:
-        Derivatives by the k parameters, (n, 2, k), and by pan and tilt, (n, 2, 2); nan for targets out of reach.
+    Returns those of n targets by the k parameters, (n, 2, k), and by pan and tilt, (n, 2, 2); nan out of reach.
     """
     nominals = np.broadcast_to(nominal_px, depths.shape)
     x_fixed = model.fixed.ray(pixels) * depths[:, None]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from cotarget.board import board_points
 from cotarget.calibration.bundle import Fit, fit, nudged, predict_pixels, robust_sigma
-from cotarget.calibration.calibrate import tells_pose
+from cotarget.calibration.calibrate import determines_pose
 from cotarget.calibration.file import Calibration
 from cotarget.calibration.initialization import place_boards
 from cotarget.calibration.model import CAMERAS, CameraName, Covariance, View
@@ -370,7 +370,7 @@ def gather(calibration: Calibration) -> Evidence | None:
     if calibration.board is None:
         return None
     points = board_points(calibration.board)
-    views = tuple(view for view in calibration.views if tells_pose(view, points))
+    views = tuple(view for view in calibration.views if determines_pose(view, points))
     for view in calibration.views:
         if view not in views:
             log.warning("%s: not in the report: its corners are too few, or all on one line", view.name)
