@@ -64,11 +64,11 @@ def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
         if tile.dark:
             size = tile.x1 - tile.x0, tile.y1 - tile.y0
             ax.add_patch(Rectangle((tile.x0, tile.y0), *size, color="black", linewidth=0, snap=False))
-    told = (
+    label = (
         f"{board.kind}, {board.corners[0]} x {board.corners[1]} inner corners, squares of {1000 * board.square:g} mm: "
         "print at 100 %"
     )
-    ax.text(columns / 2, rows + MARGIN / 2, told, ha="center", va="center", fontsize=board.square * 300)
+    ax.text(columns / 2, rows + MARGIN / 2, label, ha="center", va="center", fontsize=board.square * 300)
     page = io.BytesIO()  # on a full disk matplotlib fails to close a PDF with errors of its own
     figure.savefig(page, format=path.suffix.lower().removeprefix("."), dpi=DOTS_PER_INCH)
     write_atomically(path, page.getvalue())

@@ -207,19 +207,16 @@ def _roots(a: float, b: float, c: float) -> list[float]:
 
 
 def depth_from_size(intrinsics: Intrinsics, size: float, size_px: float, center_px: Array, *, vertical: bool) -> float:
-    """Estimate a target's depth from its known size: z = f x_size / u_measured.
+    """Estimate a target's depth along the camera's axis [m] from its known size: z = f x_size / u_measured.
 
     The size is measured between the rays through the target's two ends, so that distortion does not change the depth.
 
     Args:
         intrinsics: intrinsics of the fixed camera.
         size: true size of the target [m].
-        size_px: measured size in the image [px].
+        size_px: measured size in the image [px]; the depth is nan where it is not positive, or no ray reaches an end.
         center_px: centre of the target in the image (u, v) [px], (2,).
         vertical: True for a size along v (a height), False for one along u.
-
-    Returns:
-        Depth along the camera's axis [m]; nan where size_px is not positive, or where no ray reaches an end.
     """
     axis = 1 if vertical else 0
     half = np.zeros(2)

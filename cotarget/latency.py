@@ -23,7 +23,7 @@ from scipy.optimize import minimize_scalar
 from cotarget.board import board_points
 from cotarget.calibration import Calibration
 from cotarget.calibration.corners import find_corners
-from cotarget.calibration.session import LENS_TIMEOUT, POLL, wait_for_lens
+from cotarget.calibration.recorder import LENS_TIMEOUT, POLL, wait_for_lens
 from cotarget.config import BoardConfig
 from cotarget.control.controller import reach_of
 from cotarget.errors import CalibrationError, StaleFrameError

@@ -108,15 +108,7 @@ def miss(
 ) -> Array:
     """Compute the pointing error: the angle between the zoom camera's ray and the target [rad].
 
-    It shares no code with `solve`, so that it can check it.
-
-    Args:
-        pan: reported pan [rad], (...).
-        tilt: reported tilt [rad], (...).
-        x_base: targets in the base's frame [m], (..., 3).
-        T_head_zoom: pose of the zoom camera on the head, the paper's T.
-        head: geometry of the head.
-        ray: ray in the zoom camera's frame, (3,) or (..., 3).
+    It shares no code with `solve`, so that it can check it; see there for the arguments.
     """
     pan, tilt = head.true_angles(pan, tilt)
     shape = np.broadcast_shapes(np.shape(pan), np.shape(tilt), np.shape(x_base)[:-1])
@@ -213,14 +205,8 @@ def nearest(
 ) -> Pointing:
     """Choose the solution within the limits that is nearest to the head's present pan and tilt.
 
-    The candidates are both branches, each with whole turns added. The distance is the larger of the two axes' travels.
-
-    Args:
-        pointing: both branches of one target, as `solve` returns them.
-        pan_limits: lowest and highest reported pan [rad].
-        tilt_limits: lowest and highest reported tilt [rad].
-        now: present reported (pan, tilt) of the head [rad].
-        head: geometry of the head; its scales convert a whole turn to reported angles.
+    The candidates are both branches of one target, each with whole turns added. The distance is the larger of the two
+    axes' travels. Limits and present position are reported angles [rad].
 
     Raises:
         UnreachableError: there is no solution, or none within the limits.
@@ -290,10 +276,7 @@ def _solve_one(target: Triple[float], d: Triple[float], t: Triple[float], head: 
 
 
 def _solve_many(x_base: Array, d: Array, t: Array, head: HeadGeometry) -> Triple[Array]:
-    """Solve true pan, true tilt and range of many targets (..., 3) on rays d (..., 3), each (..., 2).
-
-    The method is that of `_solve_one`.
-    """
+    """Solve true pan, tilt and range, each (..., 2), of targets (..., 3) on rays d (..., 3), as `_solve_one` does."""
     target, d = (
         np.array(np.broadcast_to(v[..., None, :], (*v.shape[:-1], 2, 3))).reshape(-1, 3).T for v in (x_base, d)
     )
@@ -324,16 +307,9 @@ def _solve_many(x_base: Array, d: Array, t: Array, head: HeadGeometry) -> Triple
 def _closed_form(target: Triple[Any], d: Triple[Any], t: Triple[Any], sign: Any, head: HeadGeometry, lib: Any) -> Any:
     """Compute true pan, true tilt and range in closed form: (13) and (16) with atan2, for floats or arrays.
 
-    Exact for dz = 0 and any eps. For dz != 0 the range depends on the tilt and both are iterated; each round shrinks
-    the error by a factor of dz / range.
-
-    Args:
-        target: x, y and z of the target in the base's frame [m].
-        d: x, y and z of the ray in the head's frame, of length 1.
-        t: x, y and z of the zoom camera in the head's frame, from the tilt axis [m].
-        sign: 1 for the branch that faces forward, -1 for the other.
-        head: geometry of the head.
-        lib: `math` or `numpy`, for its functions.
+    The ray d has length 1, and t is the zoom camera's position from the tilt axis, both in the head's frame. The sign
+    is 1 for the branch that faces forward, -1 for the other; ``lib`` is `math` or `numpy`. The result is exact for
+    dz = 0. For dz != 0 the range depends on the tilt and both are iterated.
     """
     (a, b, c), dz = target, head.axis_offset
     sin_eps, cos_eps = math.sin(head.squareness), math.cos(head.squareness)
@@ -357,11 +333,9 @@ def _newton_step(
     cos_pan: Any, sin_pan: Any, cos_tilt: Any, sin_tilt: Any, reach: Any,
     target: Triple[Any], d: Triple[Any], t: Triple[Any] | Array, head: HeadGeometry,
 ) -> tuple[Triple[Any], Any, Triple[Any]]:  # fmt: skip
-    """Compute the residual of Eq. 5 at (pan, tilt, range), and Newton's step by Cramer's rule.
+    """Compute the residual of Eq. 5 [m], the determinant of its Jacobian, and Newton's step times that determinant.
 
-    Returns:
-        The residual, reached point minus target [m]; the determinant of its Jacobian by (pan, tilt, range); and the
-        step times that determinant.
+    The unknowns are (pan, tilt, range); the step is by Cramer's rule.
     """
     q = _tilt((reach * d[0] + t[0], reach * d[1] + t[1], reach * d[2] + t[2]), cos_tilt, sin_tilt, head)
     reached = _pan((q[0], q[1], q[2] + head.axis_offset), cos_pan, sin_pan)

@@ -1,8 +1,7 @@
 """Geometry of a calibrated rig: the fixed camera, and the zoom camera on its pan-tilt head.
 
-A fit estimates these classes, a calibration file holds them, and aiming, tracking and evaluation use them. The frames
-are "fixed" (the fixed camera), "zoom0" (the zoom camera at pan = tilt = 0), "zoom" (the zoom camera as the head turns
-it), "head" (turned by both axes) and "base" (the head's foot); see docs/method.md.
+A fit estimates these classes, a calibration file holds them, and aiming, tracking and evaluation use them. For the
+frames see `cotarget.geometry`.
 """
 
 from dataclasses import dataclass, replace
@@ -87,14 +86,10 @@ class ZoomHead:
 
     @cached_property
     def _T_zoom_head(self) -> RigidTransform:
-        """Inverse of T_head_zoom."""
         return self.hand_eye().inv()
 
     def in_base(self, x_fixed: Array) -> Array:
-        """Map a point from the fixed camera's frame to the base's, (3,) [m] (Eq. 6).
-
-        It takes a third of the time of scipy's transform.
-        """
+        """Map a point (3,) [m] from the fixed camera's frame to the base's (Eq. 6), three times as fast as scipy."""
         x, y, z = x_fixed
         return np.asarray(self._base_fixed @ np.array((x, y, z, 1.0)))
 

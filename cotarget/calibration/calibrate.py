@@ -44,7 +44,8 @@ from cotarget.calibration.model import (
     View,
     unseen,
 )
-from cotarget.calibration.session import CaptureRecorder, capture_session, with_stills
+from cotarget.calibration.recorder import CaptureRecorder, with_stills
+from cotarget.calibration.session import capture_session
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array

@@ -109,7 +109,7 @@ def judge_motions(normal: Array, noise: Array, motions: HandMotions) -> Observab
     moved, axis, axis_name, advice = _how_it_moved(motions)
     turns, shifts = _free_axes(basis)
     free = (*_along("position", "along", shifts, axis, axis_name), *_along("rotation", "about", turns, axis, axis_name))
-    text = f"{moved}: the camera's {_listed(free)} {'is' if len(free) == 1 else 'are'} free; {advice}"
+    text = f"{moved}: the camera's {listed(free)} {'is' if len(free) == 1 else 'are'} free; {advice}"
     return Observability(False, text, free, (basis / np.linalg.norm(basis, axis=0)).T)
 
 
@@ -175,7 +175,7 @@ def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapp
         if not (reason and owner == "head"):  # where an axis did not move, moving it determines the head too
             add.append(advice)
     what, add = list(dict.fromkeys(what)), list(dict.fromkeys(add))
-    return f"{reason}{_listed(what)} {'is' if len(what) == 1 else 'are'} free; {_listed(add)}"
+    return f"{reason}{listed(what)} {'is' if len(what) == 1 else 'are'} free; {listed(add)}"
 
 
 def limits_of_use(parameters: Sequence[str], focal_px: Mapping[str, float] = NO_FOCAL_PX) -> Array:
@@ -299,7 +299,7 @@ def _along(what: str, how: str, directions: Array, axis: Array | None, axis_name
     )
 
 
-def _listed(items: Sequence[str]) -> str:
+def listed(items: Sequence[str]) -> str:
     """Join items as a sentence does: a, b and c."""
     return " and ".join(filter(None, (", ".join(items[:-1]), items[-1])))
 

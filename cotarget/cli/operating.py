@@ -282,7 +282,7 @@ def point_command(options: argparse.Namespace) -> None:
     """Run `cotarget point`: move head and lens, and write a picture of each camera on request."""
     from cotarget.backends import load_config
     from cotarget.calibration.captures import write_image
-    from cotarget.calibration.session import wait_for_lens
+    from cotarget.calibration.recorder import wait_for_lens
     from cotarget.safety.stop_file import refuse_if_stopped
 
     config = load_config(options.rig)

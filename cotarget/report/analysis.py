@@ -47,11 +47,7 @@ class LensCurves:
 
 
 def lens_curves(calibration: Calibration) -> LensCurves:
-    """Evaluate the zoom lens over its focal range.
-
-    Standard deviations come from linear propagation of the covariance, and from the doubt between zoom samples
-    (`ZoomLens.center_doubt_px`).
-    """
+    """Evaluate the zoom lens over its focal range, with the covariance's and the interpolation's uncertainty."""
     lens = calibration.zoom_head.lens
     nominal = np.geomspace(lens.nominal_px[0], lens.nominal_px[-1], POINTS)
     return LensCurves(
@@ -148,9 +144,10 @@ def sigma_of(calibration: Calibration, name: str) -> float | None:
 
 def uncalibrated_px(calibration: Calibration) -> float | None:
     """Find the longest nominal focal length [px] of a lens that is not calibrated so far; None if it is, or unknown."""
-    told = calibration.provenance.get("focal_range_px")
-    longest = told[-1] if isinstance(told, list) and told and isinstance(told[-1], int | float) else None
-    return longest if longest is not None and longest > calibration.zoom_head.lens.nominal_px[-1] * FARTHER else None
+    match calibration.provenance.get("focal_range_px"):
+        case [_, int() | float() as longest] if longest > calibration.zoom_head.lens.nominal_px[-1] * FARTHER:
+            return longest
+    return None
 
 
 def can_point(calibration: Calibration) -> bool:
@@ -161,8 +158,7 @@ def can_point(calibration: Calibration) -> bool:
 def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None) -> tuple[AtFocal, ...]:
     """Predict the pointing error at nominal focal lengths [px]; None for those of all zoom samples.
 
-    Returns:
-        One result per focal length, nan where the head reaches no target; empty where nothing can be predicted.
+    Each is nan where the head reaches no target; there are none where nothing can be predicted.
     """
     nominals = calibration.zoom_head.lens.nominal_px if nominal_px is None else nominal_px
     if not can_point(calibration) or not nominals:
@@ -230,8 +226,7 @@ def group_of(parameter: str) -> str:
 def contributions(calibration: Calibration) -> dict[str, float]:
     """Compute the rms error at the longest focal length if each group were known [rad], the most important first.
 
-    Each group in turn is taken as known exactly, which leaves the conditional covariance of the others. Clearing its
-    rows instead would count correlations with the others twice.
+    A group known exactly leaves the conditional covariance of the others.
     """
     covariance = calibration.covariance
     if not can_point(calibration) or covariance is None:

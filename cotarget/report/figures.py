@@ -10,7 +10,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
@@ -85,13 +84,7 @@ def _pixels(focal_px: float) -> tuple[Any, Any]:
 
 
 def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) -> Figure:
-    """Draw the predicted error over depth, in the middle of the fixed image and in its worst corner.
-
-    Args:
-        calibration: the calibration.
-        at: focal length of the prediction.
-        boards: distances of the calibration's boards to mark [m], (n,); None for no marks.
-    """
+    """Draw the predicted error over depth in the middle and worst corner of the fixed image, with the boards [m]."""
     depths = np.geomspace(DEPTHS[0] / CURVE_REACH, DEPTHS[1] * CURVE_REACH, CURVE_POINTS)
     width, height = calibration.fixed.size
     corners = np.array([(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)], dtype=float)
@@ -133,23 +126,19 @@ def focal_figure(stops: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Fi
 class Plot:
     """Rendered figure for the page and for the folder beside it."""
 
-    name: str  # name of its file without suffix
-    png: bytes  # figure as PNG
-    svg: bytes | None  # figure as SVG, which the page then embeds; None if it embeds the PNG
+    png: bytes
     alt: str  # text alternative
-    caption: str  # caption
+    caption: str
 
     @property
     def data_uri(self) -> str:
         """The figure as a data URI, which an HTML page embeds."""
-        kind, data = ("svg+xml", self.svg) if self.svg is not None else ("png", self.png)
-        return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+        return f"data:image/png;base64,{base64.b64encode(self.png).decode('ascii')}"
 
 
 INK, BLUE, ORANGE, RED, GREY, PALE = "#22303c", "#1f6f8b", "#c8702a", "#b5403a", "#8a97a3", "#e3e8ec"
 WIDTH = 8.6  # inches: the page's column
 PNG_DPI = 170
-SVG_DPI = 72  # a unit of SVG is a point
 HEAT = "viridis"
 STYLE = {
     "font.size": 9,
@@ -168,7 +157,6 @@ STYLE = {
     "xtick.color": INK,
     "ytick.color": INK,
     "legend.frameon": False,
-    "svg.hashsalt": "cotarget",
 }
 # Length of a typical arrow over the image's width.
 ARROW_SHARE = 0.02
@@ -184,18 +172,13 @@ def styled(height: float, width: float = WIDTH) -> Iterator[Figure]:
         yield Figure(figsize=(width, height), layout="constrained")
 
 
-def as_bytes(figure: Figure, kind: str, dpi: int = PNG_DPI) -> bytes:
-    """Render a figure as "png" or "svg", reproducibly to the byte."""
+def as_png(figure: Figure) -> bytes:
+    """Render a figure as PNG, reproducibly to the byte."""
     buffer = io.BytesIO()
+    figure.set_dpi(PNG_DPI)
     with matplotlib.rc_context(STYLE):
         # By the canvas itself, because `savefig` draws a figure with a layout twice.
-        if kind == "svg":
-            figure.set_dpi(SVG_DPI)
-            FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
-        else:
-            figure.set_dpi(dpi)
-            FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
-        figure.set_layout_engine("none")  # the layout stays for a second rendering
+        FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     return buffer.getvalue()
 
 
@@ -386,17 +369,11 @@ FIGURE_NAMES = (
     "lens",
 )
 Drawn = tuple[str, Figure, str, str]  # name, figure, alt, caption
-# Figures with many marks are embedded as PNG, with this resolution [dots per inch], so that the page stays small.
-DENSE = {"pointing_map": PNG_DPI, "residuals": 140, "coverage": PNG_DPI}
 
 
 def draw(calibration: Calibration, found: Analysis) -> dict[str, Plot]:
     """Draw all figures for which the calibration has data, by the names of `FIGURE_NAMES`."""
-    made: dict[str, Plot] = {}
-    for name, figure, alt, caption in _drawn(calibration, found):
-        png = as_bytes(figure, "png", DENSE.get(name, PNG_DPI))
-        made[name] = Plot(name, png, None if name in DENSE else as_bytes(figure, "svg"), alt, caption)
-    return made
+    return {name: Plot(as_png(figure), alt, caption) for name, figure, alt, caption in _drawn(calibration, found)}
 
 
 def _drawn(calibration: Calibration, found: Analysis) -> Iterator[Drawn]:
@@ -423,8 +400,8 @@ def _pointing(calibration: Calibration, found: Analysis) -> Iterator[Drawn]:
         map_figure(calibration, last),
         "Heat maps of the predicted pointing error over the fixed image at three depths; "
         f"{digits(np.degrees(last.rms))} degrees on average",
-        "The fixed image with targets at three depths; lines join places of equal error, written in degrees. The error "
-        "grows where no board reached, and with distance where boards were near only.",
+        "The fixed image with targets at three depths; lines join places of equal error [degrees]. The error grows "
+        "where no board was shown, and with distance where boards were near only.",
     )
     yield (
         "pointing_depth",

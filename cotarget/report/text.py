@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 from cotarget.calibration.bundle import LENS_NAMES
 from cotarget.calibration.file import Calibration
 from cotarget.calibration.model import CAMERAS
-from cotarget.calibration.observability import BOTH, NEARER, OUTWARD, TILT_BOARDS
+from cotarget.calibration.observability import BOTH, NEARER, OUTWARD, TILT_BOARDS, listed
 from cotarget.calibration.planning import distance
 from cotarget.camera import Intrinsics
 from cotarget.geometry import RigidTransform
@@ -78,7 +78,7 @@ def _missing(calibration: Calibration) -> Iterator[str]:
     if calibration.provenance.get("method") == "sequential":
         yield "Calibrate again by the joint method, from the same captures: it points better and says how well."
     elif calibration.covariance is None:
-        yield "Add captures until the method can tell an uncertainty: more placements, near and far, in both cameras."
+        yield "Add captures until the method gives an uncertainty: more placements, near and far, in both cameras."
 
 
 def _disagreement(calibration: Calibration) -> Iterator[str]:
@@ -86,9 +86,9 @@ def _disagreement(calibration: Calibration) -> Iterator[str]:
     held_out = calibration.held_out
     if held_out is not None and held_out.widened > 1:
         yield (
-            f"Captures kept out miss {digits(held_out.widened)} times as far as they should, so that something is not "
-            "as the model has it: a board that is bent or not printed to scale, a mount that gives way, a lens that "
-            "moved between captures. More captures will not mend that."
+            f"Captures kept out miss {digits(held_out.widened)} times as far as they should: the model is wrong "
+            "somewhere. Look for a board that is bent or not printed to scale, a mount that gives way, a lens that "
+            "moved between captures. More captures do not help."
         )
 
 
@@ -128,8 +128,8 @@ def _between_stops(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Ite
     worst = max(between, key=lambda one: one.rms, default=None)
     if worst is not None and worst.rms > MUCH_WORSE * max(stop.rms for stop in at):
         yield (
-            f"Between the zoom samples the lens is only interpolated: at {worst.nominal_px:.0f} px by the lens's own "
-            f"account the error is {_degrees(worst.rms)} degrees. Add a sample there."
+            f"Between the zoom samples the lens is only interpolated: at a nominal {worst.nominal_px:.0f} px the error "
+            f"is {_degrees(worst.rms)} degrees. Add a sample there."
         )
 
 
@@ -166,7 +166,7 @@ def board_in_words(shape: BoardShape) -> str:
     """Describe how far the board's corners are off their nominal positions."""
     number = int(shape.beyond_chance.sum())
     if not number:
-        return "The board's corners are where they are believed to be, as far as noise lets see."
+        return "The board's corners are at their nominal positions, within noise."
     return (
         f"{number} of the board's {len(shape.beyond_chance)} corners are off by more than chance makes them: of all "
         f"corners {digits(1000 * shape.within)} mm within the board and {digits(1000 * shape.out)} mm out of it (rms)."
@@ -177,15 +177,15 @@ def _patterns(evidence: Evidence) -> Iterator[str]:
     """Advise where the residuals show a wrong board, or a pattern in an image."""
     if evidence.shape.wrong:
         yield (
-            f"{board_in_words(evidence.shape)} Measure the board, and mount it on something flat: what is predicted "
-            "here does not count it."
+            f"{board_in_words(evidence.shape)} Measure the board, and mount it on something flat: the predicted error "
+            "leaves this out."
         )
     for name in CAMERAS:
         cells = averaged(evidence.corners[name])
         known, beyond = int(np.isfinite(cells.means[:, 0]).sum()), int(cells.beyond_chance.sum())
         if beyond > PATTERN * known:
             yield (
-                f"The {TITLES[name]}'s residuals keep a pattern: {beyond} of {known} averages are larger than chance "
+                f"The {TITLES[name]}'s residuals have a pattern: {beyond} of {known} averages are larger than chance "
                 "makes them. The lens may bend the image as its model cannot, or the board is bent."
             )
 
@@ -196,8 +196,8 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
         places = empty_places(evidence.corners[name])
         if places:
             yield (
-                f"Hold boards where the {TITLES[name]} saw none: at the {listed(places)} of its image. What is "
-                "predicted there is an extrapolation."
+                f"Hold boards where the {TITLES[name]} saw none: at the {listed(places)} of its image. The predicted "
+                "error there is an extrapolation."
             )
     number = len(evidence.distances)
     turned = int(np.count_nonzero(evidence.leanings >= TURNED))
@@ -210,8 +210,8 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
     far = int(np.count_nonzero(evidence.distances > limit))
     if far < FEW_FAR * number:
         yield (
-            f"Only {far} of {count(number, 'placement')} are farther than {digits(limit)} m: add far ones, which tell "
-            "the directions of the cameras best."
+            f"Only {far} of {count(number, 'placement')} are farther than {digits(limit)} m: add far ones, which "
+            "determine the directions of the cameras best."
         )
     poses = head_poses(evidence.views)
     for axis, turn in zip(("pan", "tilt"), np.ptp(poses, axis=0) if len(poses) else (), strict=False):
@@ -224,16 +224,15 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
             )
     if (longest := uncalibrated_px(calibration)) is not None:
         yield (
-            f"The lens goes to {longest:.0f} px by its own account, but was calibrated to {lens.nominal_px[-1]:.0f} "
-            "px: no part of a board was seen beyond. Hold boards far away where the head reaches, with squares that "
-            "still show several corners there."
+            f"The lens goes to a nominal {longest:.0f} px, but was calibrated to {lens.nominal_px[-1]:.0f} px: no part "
+            "of a board was seen beyond. Hold boards far away where the head reaches, with squares that still show "
+            "several corners there."
         )
     zooms = any(view.focal_px is not None for view in evidence.views if view.camera == "zoom")
     if zooms and len(lens.stops) == 1:
         yield (
-            f"Only one focal length was calibrated, {lens.nominal_px[0]:.0f} px by the lens's own account. "
-            "If the lens zooms, capture boards at several: the longest is where an error shows most, and nothing here "
-            "speaks of it."
+            f"Only one focal length was calibrated, a nominal {lens.nominal_px[0]:.0f} px. If the lens zooms, capture "
+            "boards at several: an error shows most at the longest."
         )
 
 
@@ -395,11 +394,8 @@ def _length_sigma_mm(calibration: Calibration, name: str, T: RigidTransform) -> 
 def _head(calibration: Calibration) -> Iterator[tuple[str, ...]]:
     for name, (words, factor, unit) in HEAD_WORDS.items():
         value, parameter = getattr(calibration.zoom_head.axes, name), f"head.{name}"
-        if (
-            not name.startswith(("pan", "tilt"))
-            or sigma_of(calibration, parameter)
-            or value != getattr(IDEAL_HEAD, name)
-        ):
+        of_encoder = name.startswith(("pan", "tilt"))  # shown where it is fitted or considered
+        if not of_encoder or sigma_of(calibration, parameter) or value != getattr(IDEAL_HEAD, name):
             yield _row(calibration, parameter, words, value, factor, unit)
     yield "jitter of each axis", digits(float(np.degrees(calibration.jitter))), "degrees"
 
@@ -495,9 +491,9 @@ def value_and_sigma(value: float, sigma: float | None) -> str:
     return f"{value:.{shown}f} ± {digits(sigma, UNCERTAINTY_DIGITS)}"
 
 
-def count(number: int, one: str, many: str | None = None) -> str:
+def count(number: int, one: str) -> str:
     """Format a number of things: 1 view, 2 views."""
-    return f"{number} {one if number == 1 else many or one + 's'}"
+    return f"{number} {one if number == 1 else one + 's'}"
 
 
 def percent(share: float) -> str:
@@ -505,11 +501,6 @@ def percent(share: float) -> str:
     if 0 < share < 0.01:
         return f"{digits(100 * share, 1)} %"
     return f"{100 * share:.0f} %"
-
-
-def listed(items: Sequence[str]) -> str:
-    """Join words: a, b and c."""
-    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
 
 
 Level = Literal["good", "care", "bad", "unknown"]
@@ -540,10 +531,7 @@ class Verdict:
 
 
 def judge(calibration: Calibration, found: Analysis | None = None) -> Verdict:
-    """Judge how well a calibration points, and whether captures kept out of its fit agree.
-
-    None computes the analysis.
-    """
+    """Judge how well a calibration points, and whether captures kept out of its fit agree."""
     if calibration.zoom_head.T_head_zoom is None:
         return Verdict(_without_head(calibration), "unknown")
     if calibration.covariance is None:
@@ -554,9 +542,7 @@ def judge(calibration: Calibration, found: Analysis | None = None) -> Verdict:
     found = analyse(calibration) if found is None else found
     at, evidence = found.at, found.evidence
     if evidence is not None and _contradicts(calibration, evidence):
-        return Verdict(
-            "Does not explain the corners that are stored with it: they are not what it was made from.", "bad"
-        )
+        return Verdict("Does not explain the corners that are stored with it: it was not made from them.", "bad")
     if not np.isfinite(at[-1].rms):
         return Verdict("Reaches no point of the fixed image with the head: its geometry cannot be right.", "bad")
     width = calibration.zoom_head.lens.size[0]
@@ -564,12 +550,12 @@ def judge(calibration: Calibration, found: Analysis | None = None) -> Verdict:
     if at[-1].rms_px > FAR_OFF * width:
         doubts.append(f"that is {percent(at[-1].rms_px / width)} of the close-up's width")
     if (longest := uncalibrated_px(calibration)) is not None:
-        doubts.append(f"the lens goes to {longest:.0f} px by its own account, and nothing is known of it beyond these")
+        doubts.append(f"the lens goes to {longest:.0f} px and is not calibrated beyond these")
     if calibration.jitter:
         doubts.append(_jitter(calibration, at[-1]))
     if evidence is not None and evidence.shape.wrong:
         size = digits(1000 * np.hypot(evidence.shape.within, evidence.shape.out))
-        doubts.append(f"not counting that the board's corners are {size} mm off where they are believed to be")
+        doubts.append(f"not counting that the board's corners are {size} mm off their nominal positions")
     if held_out is None:
         doubts.append("no captures were kept out of the fit to confirm it")
     elif held_out.ratio < TOO_CAREFUL:
@@ -617,21 +603,18 @@ def _jitter(calibration: Calibration, last: AtFocal) -> str:
     share = min(2 * calibration.jitter**2 / last.rms**2, 1.0)
     angle = digits(np.degrees(calibration.jitter))
     if share > MOSTLY:
-        return f"most of it because the head misses what it reports by {angle} degrees an axis, at every pose anew"
-    return f"in it the {angle} degrees by which each axis of the head misses what it reports"
+        return f"most of it because the head misses what it reports by {angle} degrees an axis"
+    return f"including the {angle} degrees by which each axis of the head misses what it reports"
 
 
 def _mismatch(calibration: Calibration) -> list[str]:
-    """Describe the disagreement of captures kept out of the fit, if any.
-
-    It comes first in the verdict, because it widens every other figure.
-    """
+    """Describe the disagreement of captures kept out of the fit, which widens every other figure, if any."""
     held_out = calibration.held_out
     if held_out is None or held_out.widened <= 1:
         return []
     factor = digits(held_out.widened)
     return [
-        f"captures kept out of the fit miss {factor} times as far as was predicted, and the uncertainty is widened so"
+        f"captures kept out of the fit miss {factor} times as far as was predicted, and so the uncertainty is widened"
     ]
 
 
@@ -659,13 +642,8 @@ def _without_covariance(calibration: Calibration) -> Verdict:
     residuals = calibration.residuals
     fits = ""
     if residuals is not None and residuals.handeye_rms_px is not None:
-        fits = f"; its corners are explained to {digits(residuals.handeye_rms_px)} px, which tells little of pointing"
-    if method == "sequential":
-        return Verdict(
-            f"Does not say how well it points, because the sequential method gives no uncertainty{fits}.", "unknown"
-        )
+        fits = f"; its corners are explained to {digits(residuals.handeye_rms_px)} px, which says little of pointing"
     if method == "joint":
-        return Verdict(
-            f"Leaves some of its parameters undetermined, so that it cannot say how well it points{fits}.", "bad"
-        )
-    return Verdict(f"Does not say how well it points, because it carries no uncertainty{fits}.", "unknown")
+        return Verdict(f"Leaves parameters undetermined, so that it cannot say how well it points{fits}.", "bad")
+    why = "the sequential method gives no uncertainty" if method == "sequential" else "it has no uncertainty"
+    return Verdict(f"Does not say how well it points, because {why}{fits}.", "unknown")

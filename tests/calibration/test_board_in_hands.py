@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from cotarget.calibration.session import CaptureRecorder
+from cotarget.calibration.recorder import CaptureRecorder
 from cotarget.geometry import pose
 from tests.support.synthetic_rig import SyntheticRig
 

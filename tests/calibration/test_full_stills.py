@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cotarget.calibration.session import with_stills
+from cotarget.calibration.recorder import with_stills
 from cotarget.errors import StaleFrameError
 from cotarget.rig import Frame, ZoomState
 from tests.support.rigs import rig_of

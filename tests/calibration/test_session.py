@@ -12,7 +12,7 @@ from cotarget.calibration import calibrate_captures
 from cotarget.calibration.calibrate import calibrate
 from cotarget.calibration.captures import INDEX, read_index
 from cotarget.calibration.planning import GRID, Coverage
-from cotarget.calibration.session import CaptureRecorder
+from cotarget.calibration.recorder import CaptureRecorder
 from cotarget.config import BoardConfig, parse_config
 from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import pose
