@@ -53,8 +53,5 @@ def test_scales_that_are_off_are_doubted_by_as_much(calibration):
     assert calibration.covariance.sigma("head.pan_scale") == pytest.approx(0.002, abs=0.0012)
     assert calibration.covariance.sigma("head.tilt_scale") == pytest.approx(0.002, abs=0.0012)
     assert calibration.zoom_head.axes.pan_scale == 1.0
-
-
-def test_pointing_with_scales_off_is_within_twice_what_is_predicted(calibration):
     measured, predicted = pointing(calibration, SCALES)
     assert measured < 2 * predicted

@@ -90,13 +90,6 @@ def test_a_second_board_in_the_picture_is_seen(kind):
     assert another_board(two, board, corners + np.array([one.shape[1], 0]))
 
 
-def test_a_picture_of_two_boards_gives_one_and_tells_of_the_other():
-    one = draw_board(BOARD, 30)
-    two = np.concatenate([one, one], axis=0)
-    corners = find_corners(two, BOARD)
-    assert corners is None or another_board(two, BOARD, corners)
-
-
 STILL_PX = (3264, 2448)  # a still of 8 MP
 STILL_TOLERANCE_PX = 0.3  # the picture is drawn without antialiasing across the squares' edges
 

@@ -43,14 +43,10 @@ def rig():
     return rig_of(SimpleNamespace(fixed=object(), zoom=zoom, head=object(), clock=clock, board=object()))
 
 
-def test_a_rig_whose_stills_are_its_stream_stays_what_it_is(rig):
-    rig.zoom.still_size = (320, 240)
-    assert with_stills(rig) is rig
-
-
 def test_everything_else_is_the_rig_s_own(rig):
     closed = []
     rig = replace(rig, release=lambda: closed.append(True))
+    assert with_stills(replace(rig, zoom=Viewfinder(rig.clock, Viewfinder.size))).zoom.size == Viewfinder.size
     with with_stills(rig) as stills:
         assert (stills.fixed, stills.head, stills.clock, stills.board) == (rig.fixed, rig.head, rig.clock, rig.board)
         assert not closed

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from cotarget.calibration import Calibration
-from cotarget.calibration.bundle import ALL_BLOCKS, Prior, parameter_names
 from cotarget.calibration.uncertainty import cross_validate, model_of
 from experiments.calibration.synthetic.rig import NOMINAL_PX, Lens, Truth, other_rig, truth_of
 from experiments.calibration.synthetic.views import Placing
@@ -43,15 +42,6 @@ def test_an_exact_model_predicts_what_it_has_not_seen():
 PLACEMENTS = 24
 # Each placement's views miss alike, by its own two coordinates: a mean over so many scatters by a fifth. Thrice that.
 NOISE_TOLERANCE = 0.6
-
-
-@pytest.mark.slow
-def test_of_a_rig_that_is_known_only_the_boards_noise_is_left():
-    """Then every miss comes from the board's pose, as one view of the fixed camera tells it."""
-    exact = model_of(calibrated(drawn(Truth(), 0, BOARDS, noise_px=0.0)))
-    known = Prior(exact, dict.fromkeys(parameter_names(ALL_BLOCKS), 1e-8))
-    found = cross_validate(fitted(exact, drawn(Truth(), 1, PLACEMENTS, looks=2), known), POINTS, known, folds=2)
-    assert found.ratio**2 == pytest.approx(1.0, abs=NOISE_TOLERANCE)
 
 
 # The pose of a board comes from OpenCV here, of plain least squares in place of Huber's, which gives the corners beyond

@@ -10,7 +10,7 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform, Rotation
 from experiments.calibration.honesty import error_of
 from experiments.calibration.synthetic.aims import aim, draw_targets
-from experiments.calibration.synthetic.rig import Truth, other_rig
+from experiments.calibration.synthetic.rig import Lens, Truth, other_rig
 from experiments.calibration.synthetic.views import synthetic_views
 from tests.support.synthetic_calibration import (
     BOARD,
@@ -100,6 +100,26 @@ def test_single_wrong_corners_are_left_out_and_counted(views, calibration):
     predicted = rms(predicted_pointing(calibration, pixels, depths))
     assert rms(np.linalg.norm(one - other, axis=1)) < SHARE_OF_SIGMA * predicted
     assert pointing(found, Truth())[1] == pytest.approx(predicted, rel=SHARE_OF_SIGMA)
+
+
+def test_a_view_with_a_wrong_head_pose_is_left_out_and_named(views):
+    i = next(i for i, view in enumerate(views) if view.pan)
+    wrong = replace(views[i], pan=views[i].pan + np.radians(1.0), source="z.png")
+    found = calibrated([*views[:i], wrong, *views[i + 1 :]])
+    assert [one.name for one in found.residuals.rejected] == ["z.png"]
+    assert "the head stood" in found.residuals.rejected[0].reason
+    assert len(found.views) == len(views) - 1
+    assert largest_pull(found, Truth()) < PULL
+
+
+def test_k3_is_fitted_where_the_fixed_lens_has_it_and_held_otherwise(calibration):
+    assert "fixed.k3" not in calibration.covariance.parameters
+    assert calibration.fixed.lens.distortion[4] == 0.0
+    truth = replace(Truth(), fixed=Lens(686.0, 684.0, 325.0, 239.0, (-0.3, 0.1, 0.0, 0.0, -0.1)))
+    found = calibrated(drawn(truth, 0, boards=20))
+    sigma = found.covariance.sigma("fixed.k3")
+    assert found.fixed.lens.distortion[4] == pytest.approx(-0.1, abs=PULL * sigma)
+    assert sigma < 0.1
 
 
 JITTER = np.radians(0.03)

@@ -83,6 +83,13 @@ IMPLAUSIBLE = {
     ),
     "a focal length in millimetres": (with_lens(PLAIN, focal_px=(6.0, 6.0)), "fixed.fx: .* pixels"),
     "one focal length in millimetres": (with_lens(PLAIN, focal_px=(686.0, 6.0)), "fixed.fy: "),
+    "a pupil in millimetres": (
+        with_zoom_head(
+            PLAIN,
+            lens=ZoomLens((NOMINAL_PX, 2 * NOMINAL_PX), (PLAIN.fixed.lens, PLAIN.fixed.lens.scaled(2.0)), (0.0, 30.0)),
+        ),
+        r"zoom.stops\[1\].pupil: .* metres",
+    ),
 }
 
 

@@ -59,13 +59,6 @@ def test_its_error_is_that_of_the_calibration(found, predicted):
     assert predicted.error() == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=ROUNDING)
 
 
-def test_as_much_again_reduces_it_by_the_root_of_two(found, predicted, views):
-    again = predicted.worth(views, dict(found.model.boards), POINTS)
-    for times in (1, 3, 8):
-        assert predicted.error(times * again) == pytest.approx(predicted.error() / np.sqrt(1 + times), rel=ROUNDING)
-    assert predicted.with_views(views, dict(found.model.boards), POINTS).error() == predicted.error(again)
-
-
 # Corners of 16 placements tell their noise to 1 %, and where the fit ends up moves the prediction by a few more.
 REAL_TOLERANCE = 0.1
 
@@ -85,20 +78,6 @@ def test_what_was_promised_is_kept(start, found, predicted):
     planned = planned_views(number, turns, len(POINTS))
     promised = fewer.error(fewer.worth(planned, {number: found.model.boards[number]}, POINTS))
     assert promised == pytest.approx(predicted.error(), rel=REAL_TOLERANCE)
-
-
-def test_every_placement_helps_and_more_where_the_head_looks(found, predicted, views):
-    for number, T in found.model.boards.items():
-        mine = [v for v in views if v.board == number]
-        turns = [(v.pan, v.tilt) for v in mine if v.camera == "zoom"]
-        errors = [
-            predicted.error(predicted.worth(planned_views(number, turns[:count], len(POINTS)), {number: T}, POINTS))
-            for count in range(len(turns) + 1)
-        ]
-        assert all(b < a for a, b in zip([predicted.error(), *errors], errors, strict=False))
-        # What is planned is worth what is then taken, wherever the corners are.
-        taken = predicted.worth(mine, {number: T}, POINTS)
-        assert np.allclose(predicted.worth(planned_views(number, turns, len(POINTS)), {number: T}, POINTS), taken)
 
 
 HOPELESS = np.radians(10.0)

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -219,6 +220,23 @@ def test_a_late_frame_is_waited_for_again_with_the_head_where_it_should_be(camer
     assert all(a < b for a, b in itertools.pairwise(after))  # not the same old frame once more
 
 
+@pytest.mark.parametrize(("real_time", "settle"), [(False, 0.05), (True, 0.5)])
+def test_an_image_counts_some_time_after_the_head_stands(real_time, settle):
+    made = Failing()
+    made.rig.spec = replace(made.rig.spec, real_time=real_time)
+    recorder = CaptureRecorder(made.rig, BOARD)
+    recorder.turn(0.5, 0.1)
+    recorder.see_fixed(expected=False)
+    assert made.seen[0]["newer_than"] == pytest.approx(made.rig.arrives + settle)
+
+
+def test_a_board_is_expected_to_be_hidden_only_behind_one_that_was_missed():
+    coverage = Coverage(SIZE, misses=[(np.array([320.0, 240.0]), 3.0)])
+    places = np.array([[330.0, 240.0], [500.0, 240.0]])
+    assert coverage.hidden(places, 3.0).tolist() == [True, False]
+    assert coverage.hidden(places, 2.0).tolist() == [False, False]
+
+
 class Interrupted:
     """A rig whose user presses Ctrl-C at its n-th frame, and whose board's holder is gone by then."""
 
@@ -241,22 +259,19 @@ class Interrupted:
         self.rig.head.halt = lambda: self.log.append("halt")
 
 
-def test_an_interrupted_session_halts_the_head_before_anything_else_and_keeps_what_it_has(tmp_path, caplog):
+@pytest.mark.parametrize("can_halt", [True, False])
+def test_an_interrupted_session_halts_the_head_first_and_keeps_its_captures(tmp_path, caplog, can_halt):
     made = Interrupted(frames=6)
-    with pytest.raises(KeyboardInterrupt):
+    halt = made.rig.head.halt
+
+    def halts():
+        halt()
+        if not can_halt:
+            raise DeviceError("the line is lost")
+
+    made.rig.head.halt = halts
+    with pytest.raises(KeyboardInterrupt):  # hidden by no error while the session is broken off
         calibrate(made.rig, BOARD, captures_dir=tmp_path)
     assert made.log == ["halt", "board"]
     assert (tmp_path / INDEX).exists()
     assert "while the session was broken off: whoever holds the board is gone" in caplog.text
-
-
-def test_a_head_that_cannot_be_halted_hides_no_error(tmp_path):
-    made = Interrupted(frames=6)
-
-    def halt():
-        raise DeviceError("the line is lost")
-
-    made.rig.head.halt = halt
-    with pytest.raises(KeyboardInterrupt):
-        calibrate(made.rig, BOARD, captures_dir=tmp_path)
-    assert made.log == ["board"]
