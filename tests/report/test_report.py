@@ -329,9 +329,7 @@ def test_advice_follows_from_the_figures(plain):
     words = advice(shaky, Analysis((much,), (), {JITTER_GROUP: at[0].rms}, None))
     words += advice(shaky, analyse(shaky))
     between = (replace(at[0], nominal_px=777.0, rms=4 * at[0].rms),)
-    assert any(
-        "at 777 px" in item and "Add a sample" in item for item in advice(plain, replace(found, between=between))
-    )
+    assert any("777 px" in item and "Add a sample" in item for item in advice(plain, replace(found, between=between)))
     assert any("makes 99 % of the squared error" in item for item in words)
     assert any("play in the gears" in item for item in words)
     assert any("no number of them would halve it" in item for item in words)
