@@ -1,8 +1,8 @@
 """Demonstrate the method in simulation: calibrate a rig from rendered boards, then follow three targets.
 
-The software knows nothing of the simulated rig but what it measures. Calibration, runs and evaluation come one after
-the other, each in a process of its own, because a world and its renderers need some 400 MB. They hand over files. The
-process that starts them imports nothing large. So a script that calls `run_demo` needs ``if __name__ == "__main__"``.
+Calibration, runs and evaluation follow each other, each in its own process, because a world and its renderers need some
+400 MB; they hand over files. The process that starts them imports nothing large. A script that calls `run_demo` needs
+``if __name__ == "__main__"``.
 """
 
 import dataclasses
@@ -25,8 +25,7 @@ SCENES = {"book": "indoor", "person": "indoor", "bird": "outdoor"}
 CALIBRATION_SCENE = "indoor"
 # Length of the runs: two seconds to learn the background, then enough to acquire and follow the target [s].
 RUN_S = {"book": 8.0, "person": 11.0, "bird": 11.0}
-# Number of targets over which the pointing error of the calibration is stated.
-POINTING_TARGETS = 400
+POINTING_TARGETS = 400  # number of targets over which the calibration's pointing error is stated
 POINTING_STREAM = 4  # stream of random numbers for these, independent of the world's
 FRONT_DEG, BACK_DEG = -62.0, 118.0  # directions of the two pictures of the rig
 CALIBRATION = "calibration.json"

@@ -21,8 +21,7 @@ from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film, FilmWriter
 
 COLUMNS = ("frame", "t", "track", "u_px", "v_px", "width_px", "height_px", "score")
-# Length of the trail that is drawn behind a target [s].
-TRAIL_S = 1.0
+TRAIL_S = 1.0  # length of the trail that is drawn behind a target [s]
 # Colours (BGR) that are distinct on sky, grass and asphalt; a track keeps its own.
 COLOURS = ((60, 60, 255), (0, 200, 255), (80, 220, 60), (255, 160, 40), (255, 80, 220), (40, 140, 255), (230, 230, 60))
 
@@ -60,18 +59,17 @@ def run_on_film(
 ) -> FilmSummary:
     """Detect and track a target in a film.
 
-    The table has a row for each confirmed track in each frame. The score is 0 in a frame in which the target was not
-    detected and its place is predicted; a detection that several tracks share gives its score to each. Files appear
-    only when complete. A damaged film is processed as far as it can be decoded, its frames keep the numbers that they
-    have in the whole film, and the summary says so.
+    The table has a row for each confirmed track in each frame; the score is 0 where the target was not detected and its
+    place is predicted. Files appear only when complete. A damaged film is processed as far as it can be decoded; its
+    frames keep the numbers that they have in the whole film, and the summary says what is missing.
 
     Args:
         video: the film.
         target: target profile.
-        csv_path: table to write: frame,t,track,u_px,v_px,width_px,height_px,score.
-        drawn: film to write with the tracks drawn, if any.
+        csv_path: table to write, with `COLUMNS`.
+        drawn: film to write with the tracks drawn; None for none.
         progress: called after every frame with (frames done, frames in all or None, what).
-        keep: whether to keep the results so far if the run ends in an error or is interrupted.
+        keep: whether to keep the results so far if the run ends in an error.
 
     Raises:
         CotargetError: the film cannot be read, or a file cannot be written.
@@ -93,7 +91,6 @@ def _run(
     write_image: Callable[[Image, float], None] | None,
     progress: Progress | None,
 ) -> FilmSummary:
-    """Process the film once."""
     detector = make_detector(target, film.rate_hz)
     tracker = Tracker(tracking_settings(target), film.size)
     trails = Trails()
@@ -111,14 +108,18 @@ def _run(
             write_image(trails.draw(frame.image, tracks, frame.t), frame.t)
         if progress is not None:
             progress(film.number + 1, film.count, "detecting")
-    duration = max(times) - min(times)
     return FilmSummary(
-        len(times), with_target, len(numbers), duration, film.rate_hz, film.number, film.shortfall or None
+        frames=len(times),
+        frames_with_target=with_target,
+        tracks=len(numbers),
+        duration_s=max(times) - min(times),
+        rate_hz=film.rate_hz,
+        last_frame=film.number,
+        shortfall=film.shortfall or None,
     )
 
 
 def _row(index: int, t: float, track: Track) -> list[str]:
-    """Format a track's line of the table."""
     numbers = (*track.center_px, *track.size_px)
     score = track.score if track.missed == 0 else 0.0
     return [str(index), f"{t:.4f}", str(track.id), *(f"{x:z.2f}" for x in numbers), f"{score:.3f}"]

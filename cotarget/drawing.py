@@ -21,7 +21,7 @@ from cotarget.pipeline import State, Step
 from cotarget.rig import Image
 
 OFFSET, FOCAL = "#1f6f8b", "#777777"  # colours of the curves
-ROOM = 1.25  # margin above and below the focal lengths, as a factor
+FOCAL_MARGIN = 1.25  # factor between the focal lengths and the ends of their axis
 
 
 def plot_aim_error(path: Path, rows: Mapping[str, Sequence[Row]]) -> None:
@@ -45,7 +45,7 @@ def aim_error_figure(rows: Mapping[str, Sequence[Row]]) -> Figure:
         ax.set(ylim=(0, 50), xlim=(t[0], t[-1]), ylabel="offset [% of width]", title=name)
         zoom = ax.twinx()
         zoom.semilogy(t, [row.focal_px for row in run], lw=1.0, ls="--", color=FOCAL, label="focal length")
-        zoom.set_ylim(focals[0] / ROOM, focals[1] * ROOM)
+        zoom.set_ylim(focals[0] / FOCAL_MARGIN, focals[1] * FOCAL_MARGIN)
         zoom.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         zoom.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         zoom.yaxis.set_minor_locator(NullLocator())
@@ -77,14 +77,14 @@ BOX_MARGIN_PX = 4  # distance of a drawn box from the target
 def write_text(
     image: Image, text: str, at: Sequence[float] | Array, colour: tuple[int, int, int] = PAPER, *, outlined: bool = True
 ) -> None:
-    """Write text into an image, as large as the image asks for.
+    """Write text into an image, in letters that grow with the image.
 
     Args:
         image: the image, which is changed.
         text: the text.
-        at: pixel of the text's lower left corner.
+        at: lower left corner of the text [px].
         colour: colour of the letters, BGR.
-        outlined: whether they have a dark outline, which makes them legible on any background.
+        outlined: whether they have a dark outline, to be legible on any background.
     """
     scale, font = _scale_of(image), cv2.FONT_HERSHEY_SIMPLEX
     u, v = round(at[0]), round(at[1])
@@ -95,27 +95,27 @@ def write_text(
 
 
 def _scale_of(image: Image) -> float:
-    """Scale of lines and letters in an image."""
+    """Return the scale of lines and letters in an image."""
     return max(1.0, image.shape[1] / FULL_WIDTH_PX)
 
 
 def _width_of(text: str, scale: float) -> int:
-    """Width of a text [px]."""
+    """Return the width of a text [px]."""
     return int(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale * LETTER_SCALE, 1)[0][0])
 
 
 def draw_box(
     image: Image, center_px: Array, size_px: Array, colour: tuple[int, int, int], label: str, *, bold: bool = True
 ) -> None:
-    """Draw a box around a target, with its label; the target itself stays free.
+    """Draw a labelled box around a target, which stays visible.
 
     Args:
         image: the image, which is changed.
         center_px: centre of the target (u, v), (2,).
-        size_px: its width and height, (2,).
+        size_px: width and height of the target, (2,).
         colour: colour of the line, BGR; a dark line is around it.
         label: text above the box, or below it at the image's top.
-        bold: whether its line is bold; it grows outwards.
+        bold: whether the line is bold; it grows outwards.
     """
     scale = _scale_of(image)
     line = round(2 * scale) if bold else 1
@@ -130,7 +130,7 @@ def draw_box(
 
 
 def write_picture(path: Path, image: Image) -> None:
-    """Write an image as PNG, in one step.
+    """Write an image as PNG, which appears under its name when complete.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -150,12 +150,7 @@ def captioned(image: Image, text: str) -> Image:
 
 
 def draw_wide(step: Step, factor: float = 1.0) -> Image:
-    """Draw the fixed camera's frame with every confirmed track's box, the followed one in another colour.
-
-    Args:
-        step: the Step.
-        factor: by which the frame is enlarged, (factor H, factor W, 3).
-    """
+    """Draw the fixed camera's frame, enlarged by a factor, with boxes of confirmed tracks; the followed one differs."""
     image = _enlarged(step.fixed.image, factor)
     for track in step.tracks:
         if track.confirmed:
@@ -175,7 +170,7 @@ def _enlarged(image: Image, factor: float) -> Image:
 
 
 def draw_zoom(step: Step, factor: float = 1.0) -> Image:
-    """Draw the zoom camera's frame with a small cross at its centre; ``factor`` as for `draw_wide`."""
+    """Draw the zoom camera's frame, enlarged by a factor, with a small cross at its centre."""
     image = _enlarged(step.zoom.image, factor)
     line = max(1, round(_scale_of(image)))
     u, v, near, far = image.shape[1] // 2, image.shape[0] // 2, 4 * line, 12 * line
@@ -187,13 +182,7 @@ def draw_zoom(step: Step, factor: float = 1.0) -> Image:
 
 
 def side_by_side(step: Step, title: str, t: float) -> Image:
-    """Draw one frame of a film: both cameras' frames of one height, with detection and state of the pipeline.
-
-    Args:
-        step: the Step.
-        title: name of the target.
-        t: time since the film began [s].
-    """
+    """Draw a frame of a film: both cameras' frames with tracks, state, and the time ``t`` since the film began [s]."""
     heights = step.fixed.image.shape[0], step.zoom.image.shape[0]
     fixed, zoom = (max(FULL_HEIGHT_PX, *heights) / height for height in heights)
     depth = f"   depth {step.aim.depth:.1f} m" if step.aim is not None else ""
@@ -224,14 +213,13 @@ def _explained(image: Image, reason: str) -> Image:
 
 
 class TargetStages:
-    """Choose the Steps for the picture of a target: before, centred, and close-up.
+    """Choose the Steps for the picture of a target, by what the pipeline knows: before, centred, and close-up.
 
-    It uses what the pipeline itself knows: the target's place in a zoom frame, and the reported focal length at the
-    frame's exposure.
+    Args:
+        shortest_px: shortest nominal focal length of the zoom camera.
     """
 
     def __init__(self, shortest_px: float) -> None:
-        """Create an empty choice; ``shortest_px`` is the shortest nominal focal length."""
         self._shortest = shortest_px
         self._largest, self._widest, self._since = 0.0, math.inf, math.inf
         self._recent: deque[Step] = deque(maxlen=RECENT_STEPS)
@@ -259,7 +247,7 @@ class TargetStages:
             self._largest, self.close = size, step
 
     def _focal_of_view(self) -> float:
-        """Focal length of the newest zoom frame, which is older than the newest state of the lens [px]."""
+        """Interpolate the focal length at the newest zoom frame, which is older than the lens's newest state [px]."""
         t, focal = [s.lens.t for s in self._recent], [s.lens.focal_px for s in self._recent]
         return float(np.interp(self._recent[-1].zoom.t, t, focal))
 
@@ -280,7 +268,7 @@ class TargetStages:
         return np.vstack([np.hstack(panels[i : i + 2]) for i in range(0, len(panels), 2)])
 
     def _magnified(self, step: Step) -> Image:
-        """Enlarge the fixed frame around the target to the close-up's scale (if both lenses are alike when short)."""
+        """Enlarge the fixed frame around the target to the close-up's scale, if both shortest lenses are equal."""
         image = step.fixed.image
         if step.target is None:
             return image
@@ -292,7 +280,7 @@ class TargetStages:
 
 
 def _off_center(step: Step) -> float:
-    """Distance of the target from the centre of a Step's zoom frame, over its width; infinite if it was not found."""
+    """Return the target's distance from the centre of a zoom frame, over its width; infinite if it was not found."""
     height, width = step.zoom.image.shape[:2]
     if step.found is None or step.found.t != step.zoom.t:
         return math.inf

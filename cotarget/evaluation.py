@@ -1,8 +1,7 @@
-"""Compare Steps and calibrations with the simulation's ground truth, and stand in for detectors by the truth.
+"""Evaluate Steps and calibrations by the simulation's ground truth, which the pipeline cannot see.
 
-The pipeline cannot see the ground truth. `observe` and `pointing_errors` evaluate with it. `TruthDetector`,
-`TruthFinder` and `true_calibration` replace detector, registration and calibration by the truth with noise, for runs
-that need neither rendering nor boards.
+`observe` and `pointing_errors` evaluate. `TruthDetector`, `TruthFinder` and `true_calibration` replace detector,
+registration and calibration by the truth with noise, for runs that need neither rendering nor boards.
 """
 
 import dataclasses
@@ -61,13 +60,8 @@ FINDER_SEED = 1 << 33
 NumbersAt = Callable[[float], np.random.Generator]
 
 
-def seeded(seed: int) -> NumbersAt:
-    """Make random numbers for each time, by a new generator each."""
-    return lambda t: np.random.default_rng((seed, microseconds(t)))
-
-
 def counted(seed: int) -> NumbersAt:
-    """Make random numbers for each time by one counter-based generator, ten times as fast as `seeded`."""
+    """Make random numbers that depend on the seed and the time alone, by one counter-based generator."""
     bits = np.random.Philox(key=seed)
     rng, begin = np.random.Generator(bits), bits.state
 
@@ -104,7 +98,6 @@ class TruthNoise:
     smallest_px: float = 4.0
 
     def __post_init__(self) -> None:
-        """Refuse values that are no noise."""
         for name, value in asdict(self).items():
             if not (isinstance(value, Real) and 0 <= float(value) < math.inf):
                 raise ConfigError(f"noise.{name}: {value!r} is not a number from 0 on")
@@ -126,21 +119,11 @@ class TruthDetector:
         seed: int,
         noise: TruthNoise = TruthNoise(),
         names: Iterable[str] | None = None,
-        numbers: Callable[[int], NumbersAt] = seeded,
         camera: CameraName = "fixed",
     ) -> None:
-        """Create a detector.
-
-        Args:
-            truth: ground truth of the world.
-            seed: seed of the noise.
-            noise: errors of the detections.
-            names: names of the targets to detect; all by default.
-            numbers: makes the random numbers of the seed.
-            camera: camera whose frames are searched; the fixed one by default.
-        """
+        """Create a detector of the targets with these names, by default all, in the frames of one camera."""
         self._camera = camera
-        self._truth, self._noise, self._numbers_at = truth, noise, numbers(seed)
+        self._truth, self._noise, self._numbers_at = truth, noise, counted(seed)
         self._names = tuple(truth.targets if names is None else names)
 
     def detect(self, frame: Frame) -> list[Detection]:
@@ -149,7 +132,7 @@ class TruthDetector:
         rng = self._numbers_at(frame.t)
         found = []
         for name in self._names:
-            # Draw whether the target is seen or not, so that no target changes another's noise.
+            # Drawn for every target, seen or not, so that none changes another's noise.
             draws, luck = rng.normal(size=4).tolist(), rng.random()
             box = self._truth.box(name, self._camera, frame.t)
             if box is None or luck < noise.miss:
@@ -169,10 +152,9 @@ class TruthDetector:
 
 
 class TruthFinder:
-    """Find a target in the zoom image by ground truth with noise, if it is where it is expected; without an image.
+    """Find a target in the zoom image by ground truth with noise, for `FollowSettings.finder`.
 
-    It is meant for `FollowSettings.finder`. Like the real finder it gives the body's centre. Occlusion is not
-    considered.
+    Like the real finder it gives the body's centre, if that is where it is expected. Occlusion is not considered.
     """
 
     SIGMA_PX = 1.0  # of the noise; the real finder assumes as much for lens, head and frame times
@@ -186,16 +168,7 @@ class TruthFinder:
         seed: int,
         missed: Callable[[float], bool] = lambda t: False,
     ) -> None:
-        """Create a finder.
-
-        Args:
-            calibration: calibration of the rig.
-            target: target profile.
-            truth: ground truth of the world.
-            name: name of the target.
-            seed: seed of the noise.
-            missed: whether the target is not found in a frame, by its exposure time [s].
-        """
+        """Create a finder of the target ``name``, which fails in frames whose exposure times [s] are ``missed``."""
         self._view = CloseupFinder(calibration, target).view
         self._truth, self._name, self._missed = truth, name, missed
         self._numbers_at = counted(seed + FINDER_SEED)
@@ -212,9 +185,8 @@ class TruthFinder:
         view, box = self._view(expected), self._truth.box(self._name, "zoom", frame.t)
         if view is None or box is None or self._missed(frame.t):
             return None
-        at = self._truth.center_px(self._name, "zoom", frame.t) + self.SIGMA_PX * self._numbers_at(frame.t).normal(
-            size=2
-        )
+        noise = self.SIGMA_PX * self._numbers_at(frame.t).normal(size=2)
+        at = self._truth.center_px(self._name, "zoom", frame.t) + noise
         off = at - view.center_px
         inside = (at >= 0).all() and (at <= np.array(frame.image.shape[1::-1]) - 1).all()
         if not inside or off @ np.linalg.solve(view.covariance, off) > GATE:
@@ -226,23 +198,17 @@ class TruthFinder:
 POINTING_DEPTHS = (4.0, 30.0)
 # Dictionary of the simulated targets' markers; sim_assets/make_assets.py draws them.
 MARKERS = cv2.aruco.DICT_4X4_50
-# A marker is searched in its target's true box, widened on each side by this part of the larger side ...
-SEARCH_MARGIN = 0.25
-SEARCH_PX = 8.0  # ... plus this, for motion blur and the windows of the marker detector [px]
+# A marker is searched in its target's true box, widened on each side by a part of the larger side and some pixels, for
+# motion blur and the windows of the marker detector.
+SEARCH_MARGIN, SEARCH_PX = 0.25, 8.0
 ENLARGED = 2  # magnification for the marker detector, which needs some eight pixels per cell where four are readable
 
 
 def add_row(rows: list[Row], step: Step, truth: Truth, name: str, target: TargetProfile) -> None:
     """Append a Step's row, unless its zoom frame has a row already.
 
-    A zoom camera slower than the fixed one has no new frame in some Steps; those frames would count twice.
-
-    Args:
-        rows: rows of earlier Steps, oldest first; extended in place.
-        step: step of the pipeline.
-        truth: ground truth of the simulated world.
-        name: name of the followed target.
-        target: target profile, for the dimension and the wanted size.
+    A zoom camera slower than the fixed one has no new frame in some Steps; those frames would count twice. The other
+    arguments are those of `observe`.
     """
     if not rows or step.zoom.t > rows[-1].t_s:
         rows.append(observe(step, truth, name, target))
@@ -298,19 +264,12 @@ def observe(step: Step, truth: Truth, name: str, target: TargetProfile) -> Row:
 
 
 def closeup_of(truth: Appearances, name: str, target: TargetProfile, t: float) -> Closeup:
-    """Ground truth of a target in the zoom camera at a time.
-
-    Args:
-        truth: ground truth of the simulated world.
-        name: name of the target.
-        target: target profile, for the dimension and the wanted size.
-        t: time of the zoom frame [s].
-    """
+    """Return the ground truth of a target in the zoom camera at a time [s]; arguments as for `observe`."""
     return _closeup(truth, name, target, t, truth.silhouette(name, "zoom", t))
 
 
 def _closeup(truth: Appearances, name: str, target: TargetProfile, t: float, outline: Silhouette | None) -> Closeup:
-    """Compute the close-up from the target's outline in the zoom image; None for a target behind the camera."""
+    """Compute the close-up by the target's outline in the zoom image, which is None behind the camera."""
     lens = truth.lens("zoom", t)
     u, v = truth.center_px(name, "zoom", t).tolist()
     size = math.nan
@@ -333,14 +292,9 @@ def _closeup(truth: Appearances, name: str, target: TargetProfile, t: float, out
 
 
 def decodes(frame: Frame, outline: Silhouette | None, marker: int) -> bool:
-    """Whether a target's marker can be read in a frame.
+    """Return whether a target's marker, an id of `MARKERS`, can be read in a frame.
 
-    Only the surroundings of the target's true box are searched: that is fast, and a marker elsewhere is another's.
-
-    Args:
-        frame: frame of either camera.
-        outline: true outline of the target in it.
-        marker: id of the marker in MARKERS.
+    Only the surroundings of the true outline are searched: that is fast, and a marker elsewhere is another target's.
     """
     if outline is None or outline.visible <= 0:
         return False
@@ -356,13 +310,7 @@ def decodes(frame: Frame, outline: Silhouette | None, marker: int) -> bool:
 
 
 def off_target(tracks: Iterable[Track], outlines: Iterable[Silhouette | None]) -> list[int]:
-    """List the ids of confirmed tracks that are on no target.
-
-    Args:
-        tracks: tracks at a fixed frame's time.
-        outlines: true outlines of the targets in it; a track is on a target if its distance from the centre of the box
-            is at most the box's larger side.
-    """
+    """List the ids of confirmed tracks that are on no target, by the true outlines in the fixed frame."""
     found = [outline for outline in outlines if outline is not None]
     return [track.id for track in tracks if track.confirmed and not any(_is_on(track, each) for each in found)]
 
@@ -371,10 +319,6 @@ def on_target(tracks: Iterable[Track], outlines: Mapping[str, Silhouette | None]
     """List confirmed tracks with a detection of their own, each with every target that it is on, the nearest first.
 
     A coasting track is no evidence, and one that shares a box with others would be on all of them.
-
-    Args:
-        tracks: tracks at a fixed frame's time.
-        outlines: true outlines of the targets in it, by name.
     """
     seen = [track for track in tracks if track.confirmed and not track.missed and not track.shared]
     return [
@@ -389,12 +333,12 @@ def on_target(tracks: Iterable[Track], outlines: Mapping[str, Silhouette | None]
 
 
 def _is_on(track: Track, outline: Silhouette) -> bool:
-    """Whether a track's distance from the centre of an outline's box is at most the box's larger side."""
+    """Return whether a track is at most the outline's larger side from the centre of its box."""
     return _off_px(track, outline) <= float(outline.size_px.max())
 
 
 def _off_px(track: Track, outline: Silhouette) -> float:
-    """Distance of a track from the centre of an outline's box [px]."""
+    """Return the distance of a track from the centre of an outline's box [px]."""
     return float(np.linalg.norm(track.center_px - (outline.low_px + outline.high_px) / 2))
 
 

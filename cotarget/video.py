@@ -1,8 +1,4 @@
-"""Read films that PyAV can decode, and write H.264 yuv420p films that any player and browser opens.
-
-`Places` numbers the frames as they are decoded, so that a frame that cannot be decoded keeps its number and does not
-shift those after it. The choice of x264's settings: docs/design-notes.md.
-"""
+"""Read films that PyAV can decode, and write H.264 yuv420p films that any player and browser opens."""
 
 import contextlib
 import os
@@ -22,19 +18,17 @@ from cotarget.files import PartFile, write_all
 from cotarget.rig import Frame, Image
 from cotarget.safety.signals import DeferredSignals
 
-# Codecs in which a packet without a frame is normal.
-HIDES_FRAMES = ("vp8",)
-# Codecs in which a packet smaller than this repeats the previous frame [bytes], FFmpeg's MAX_NVOP_SIZE.
-REPEATS, SMALLEST = ("mpeg4",), 20
+# Codecs in which a packet without a frame is normal, and those in which one smaller than FFmpeg's MAX_NVOP_SIZE [bytes]
+# repeats the frame before it.
+HIDES_FRAMES, REPEATS, SMALLEST = ("vp8",), ("mpeg4",), 20
 
 
 class Places:
-    """Number the frames of a film as they are decoded.
+    """Number the frames of a film as they are decoded, so that lost frames do not shift those after them.
 
-    A packet makes a frame. Until the decoder refuses a packet, frames are counted, even if some packets make none.
-    After that, packets due before a decoded frame that did not become frames were lost and keep their numbers; so do
-    those after the last frame. If packets have no presentation time, or a frame may have two packets, frames are only
-    counted.
+    Until the decoder refuses a packet, frames are counted. After that, packets due before a decoded frame that did not
+    become frames were lost and keep their numbers, as do those after the last frame. Where packets have no presentation
+    time, or a frame may have two packets, frames are only counted.
 
     Attributes:
         number: number of the newest frame, from 0.
@@ -42,7 +36,6 @@ class Places:
     """
 
     def __init__(self, stream: av.VideoStream) -> None:
-        """Prepare to number a film from which no packet was decoded yet."""
         stream.codec_context.copy_opaque = True  # so that a frame carries its packet's number
         codec = stream.codec_context.name
         self.number, self.reason = -1, ""
@@ -120,16 +113,11 @@ class Places:
 
 
 def reason_of(error: Exception) -> str:
-    """First line of an error, without the path that FFmpeg appends."""
+    """Return the first line of an error, without the path that FFmpeg appends."""
     return (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
 
 
-# Frame rate of a film that does not state its own [Hz].
-FALLBACK_RATE_HZ = 25.0
-# x264's constant quality: 18 is close to invisible loss, 23 its default; boxes and digits stay sharp at 20.
-QUALITY = "20"
-# x264's trade of time against size: this takes a fifth of its default's time for files a tenth larger.
-PRESET = "veryfast"
+FALLBACK_RATE_HZ = 25.0  # frame rate of a film that does not state its own [Hz]
 # Containers whose header holds the duration; for others FFmpeg estimates it from the content or the bit rate.
 TELL_DURATION = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "flv", "asf")
 MICROSECONDS = 1e6  # FFmpeg's units of duration per second
@@ -140,10 +128,9 @@ SHORT_S, SHORT_FRAMES = 0.5, 3
 class Film:
     """Read a film: iterate over it for its frames. A context manager.
 
-    Frames that cannot be decoded are left out, and `shortfall` says so. It considers packets that the decoder refuses;
-    packets without a frame after the first refusal, or after the last frame; and the end of the film against its
-    header. It does not find frames decoded with errors, nor packets missing from the container, except in AVI, whose
-    header has the number of frames.
+    Frames that cannot be decoded are left out, and `shortfall` says so, as it does where a film ends before the time in
+    its header. Frames decoded with errors are not noticed, nor are packets missing from the container, except in AVI,
+    whose header has the number of frames.
 
     Attributes:
         path: file of the film.
@@ -198,8 +185,6 @@ class Film:
 
     def __iter__(self) -> Iterator[Frame]:
         """Decode the frames in order; times are the film's own [s], or from the frame rate if it has none.
-
-        Frames that cannot be decoded are left out, and a truncated file ends early; `shortfall` says so afterwards.
 
         Raises:
             CotargetError: nothing can be decoded, or the image's size changes.
@@ -262,6 +247,7 @@ class Film:
         return "its last frame is damaged" if damaged else ""
 
 
+QUALITY, PRESET = "20", "veryfast"  # of x264; see docs/design-notes.md
 # Clock of a film's frames [Hz], MPEG's own. A container for constant rates alone, such as AVI, counts in frames.
 TICKS_HZ = 90_000
 LEAST_S = 1e-3  # least time from frame to frame [s], Matroska's unit

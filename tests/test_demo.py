@@ -1,10 +1,12 @@
-"""The demo: results that appear together or not at all, and (slow) the figures that it must reach."""
+"""The demo: results that appear together or not at all, and (slow) the figures that it reaches."""
 
 import dataclasses
 import json
+import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -29,7 +31,7 @@ def contents(folder):
     return {path.name: path.read_text() for path in folder.iterdir()}
 
 
-def test_a_finished_run_replaces_its_own_files_at_once_and_no_others(tmp_path):
+def test_a_finished_run_replaces_its_own_files_alone(tmp_path):
     out = tmp_path / "deep" / "demo"
     for text in ("old", "new"):
         with finished_together(out) as work:
@@ -40,7 +42,7 @@ def test_a_finished_run_replaces_its_own_files_at_once_and_no_others(tmp_path):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ConfigError("no"), ValueError("bug")])
-def test_a_run_that_fails_leaves_the_old_files_and_no_rubbish(tmp_path, error):
+def test_a_failed_run_leaves_the_old_files_and_no_others(tmp_path, error):
     def fail_half_way():
         with finished_together(tmp_path) as work:
             (work / "metrics.json").write_text("half")
@@ -52,7 +54,16 @@ def test_a_run_that_fails_leaves_the_old_files_and_no_rubbish(tmp_path, error):
     assert contents(tmp_path) == {"metrics.json": "old"}
 
 
-def test_a_folder_that_cannot_be_is_named(tmp_path):
+def test_folders_of_killed_runs_are_removed_an_hour_later(tmp_path):
+    for name, age_s in ((".unfinished-old", 3700), (".unfinished-new", 3500)):
+        (tmp_path / name).mkdir()
+        os.utime(tmp_path / name, (time.time() - age_s,) * 2)
+    with finished_together(tmp_path):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == [".unfinished-new"]
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("x")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(ConfigError, match=re.escape(str(out))) as caught, finished_together(out):
@@ -60,7 +71,7 @@ def test_a_folder_that_cannot_be_is_named(tmp_path):
         assert "\n" not in str(caught.value)
 
 
-def test_the_summary_tells_every_target_and_a_dash_for_what_was_not_measured():
+def test_the_summary_has_a_line_a_target_and_a_dash_for_a_missing_figure():
     lines = [line.split() for line in summary(METRICS).splitlines()]
     assert lines[0][-5:] == ["median", "0.0123,", "p95", "0.0456", "degrees"]
     assert lines[1:] == [

@@ -1,4 +1,4 @@
-"""Pictures and plots: which of a run's Steps a picture of a target shows, and that what is written is in the clear."""
+"""Pictures and plots: the Steps that a target's picture shows, and legible boxes, texts and legends."""
 
 import dataclasses
 
@@ -34,14 +34,14 @@ def test_the_close_up_is_of_the_largest_box_of_the_target_alone():
     assert staged(steps).close is steps[1]
 
 
-def test_centred_is_where_the_target_is_seen_in_the_middle_while_the_lens_is_shortest():
+def test_centred_is_the_step_with_the_shortest_lens_of_those_near_the_middle():
     """While the head turns and the lens goes in: off, off, nearly (3 % of 64 px), in the middle, off, in the middle."""
     course = [(700, 12), (900, 5), (1200, 2), (1500, 0), (2000, -4), (2500, 0)]
     steps = [step(0.04 * i, focal_px=focal, off_px=off) for i, (focal, off) in enumerate(course)]
     assert staged(steps).centred is steps[2]
 
 
-def test_centred_is_nothing_that_was_seen_in_another_picture_or_not_at_all():
+def test_a_step_whose_zoom_frame_does_not_show_the_target_is_not_centred():
     unseen = [step(0.0, seen_s=0.04), dataclasses.replace(step(0.04), found=None)]
     assert staged(unseen).centred is None
     steps = [*unseen, step(0.08)]
@@ -53,6 +53,20 @@ def test_centred_comes_before_the_close_up():
     stages = staged(steps)
     assert stages.close is steps[1]
     assert stages.centred is steps[0]
+
+
+def test_the_picture_of_a_target_enlarges_the_fixed_frame_as_much_as_the_close_up():
+    """At five times the shortest focal length a square of 4 px has 25 times its area in panel (e)."""
+    close = step(SIZE_KNOWN_S, focal_px=3000.0)
+    image = PICTURE.copy()
+    image[18:22, 28:32] = 255  # near the track's centre, (30, 20)
+    close = dataclasses.replace(close, fixed=Frame(image, close.t))
+    picture = staged([step(0.0), close]).picture("bird")
+    height, width = PICTURE.shape[:2]
+    assert picture.shape[1] == 2 * width
+    top = 2 * picture.shape[0] // 3
+    area = (picture[top : top + height, :width, 0] / 255).sum()
+    assert area == pytest.approx(4 * 4 * 25, rel=0.1)  # the part that is enlarged has whole pixels
 
 
 def test_the_rigs_frames_have_the_names_of_the_paper(monkeypatch):
@@ -69,7 +83,7 @@ BIRD_PX = np.array([6.0, 4.0])
 @pytest.mark.parametrize("grey", [0, 60, 128, 200, 255])
 @pytest.mark.parametrize("width", [320, 640, 1280])
 @pytest.mark.parametrize("bold", [True, False])
-def test_a_box_can_be_seen_on_any_background_and_leaves_a_small_bird_free(grey, width, bold):
+def test_a_box_is_visible_on_any_background_and_does_not_cover_its_target(grey, width, bold):
     image = np.full((width * 3 // 4, width, 3), grey, np.uint8)
     u, v = width // 2, width // 4
     draw_box(image, np.array([u, v]), BIRD_PX, (0, 200, 255), "1", bold=bold)
@@ -111,7 +125,7 @@ def test_a_caption_fits_below_its_image(width):
 @pytest.mark.parametrize(
     ("fixed", "zoom"), [((320, 240), (320, 240)), ((640, 480), (320, 240)), ((320, 240), (800, 600))]
 )
-def test_a_film_shows_both_cameras_equally_high_and_not_too_small_to_be_read(fixed, zoom):
+def test_a_film_shows_both_cameras_at_one_height_of_at_least_480_px(fixed, zoom):
     made = step(0.0)
     images = (np.full((size[1], size[0], 3), 128, np.uint8) for size in (fixed, zoom))
     made = dataclasses.replace(
@@ -124,7 +138,7 @@ def test_a_film_shows_both_cameras_equally_high_and_not_too_small_to_be_read(fix
     assert image.shape[0] > height
 
 
-def test_a_film_shows_the_reason_at_the_foot_of_the_fixed_cameras_image():
+def test_a_film_shows_the_reason_at_the_bottom_of_the_fixed_cameras_image():
     """In more lines for more words."""
     bright = np.full((480, 640, 3), 255, np.uint8)
     plain = dataclasses.replace(step(0.0), fixed=Frame(bright, 0.0), zoom=Frame(bright, 0.0))

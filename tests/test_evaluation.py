@@ -1,4 +1,4 @@
-"""Steps and calibrations beside the truth of a rendered world, whose answers are known by construction."""
+"""Steps and calibrations against the truth of a rendered world, whose answers are known by construction."""
 
 import dataclasses
 import math
@@ -9,13 +9,13 @@ import pytest
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import parse_config
 from cotarget.detection import Detection
-from cotarget.evaluation import add_row, decodes, observe, pointing_errors, true_calibration
+from cotarget.evaluation import add_row, closeup_of, decodes, observe, pointing_errors, true_calibration
 from cotarget.geometry import pose
 from cotarget.pipeline import State, Step
 from cotarget.rig import Frame
 from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
-from cotarget.targeting import Reach
+from cotarget.targeting import Aim, Reach
 from cotarget.tracking.track import Track
 from tests.support.rigs import with_zoom_head
 
@@ -59,7 +59,7 @@ def test_the_true_calibration_points_exactly(book):
     assert np.degrees(errors).max() < EXACT_DEG
 
 
-def test_a_boresight_that_is_off_by_a_tenth_of_a_degree_points_off_by_as_much(book):
+def test_a_boresight_off_by_a_tenth_of_a_degree_has_that_pointing_error(book):
     """Gamma turned about y by 0.1 degree: the line of sight misses by 0.1 degree in the middle, at most that aside."""
     true = true_calibration(book, stops=1)
     off = with_zoom_head(true, T_zoom0_fixed=pose([0, 0, 0], [0, 0.1, 0]) * true.zoom_head.T_zoom0_fixed)
@@ -68,7 +68,7 @@ def test_a_boresight_that_is_off_by_a_tenth_of_a_degree_points_off_by_as_much(bo
     assert np.median(errors) > 0.09
 
 
-def test_a_principal_point_that_is_off_matters_less_at_a_longer_focal_length(book):
+def test_a_wrong_principal_point_has_less_effect_at_a_longer_focal_length(book):
     """The middle of the image is taken for a ray 20 px aside of the true one, at five times the shortest 692 px."""
     true = true_calibration(book, stops=1)
     stop = dataclasses.replace(true.zoom_head.lens.stops[0], center_px=(346.0, 235.0))
@@ -81,7 +81,7 @@ def test_a_principal_point_that_is_off_matters_less_at_a_longer_focal_length(boo
 
 
 def test_the_true_calibration_at_a_focal_length_points_exactly_with_it():
-    """Of a lens whose optics move: the pupil moves both T and Gamma."""
+    """Of a lens whose pupil moves, and with it both T and Gamma."""
     world = SimWorld(parse_config({"sim": {"scene": "indoor", "effects": {"optics": True}}}))
     nominal = 4000.0
     lens = world.truth().zoom_lens_for(nominal)
@@ -140,10 +140,13 @@ def row_of(world, **changes):
     return observe(step_of(world, **changes), world.truth(), "book", world.config.target("book"))
 
 
-def test_a_row_says_what_is_so(book):
+def test_a_row_holds_the_truth_and_the_commands(book):
     """The book, 0.234 m at 10 m and 0.4 m to the left of the zoom camera: u = 326 - 692 * 0.4 / 10, v = 235."""
-    row = row_of(book, head_commands=3, lens_commands=2)
+    aim = Aim(0.1, 0.2, 692.0, 692.0, False, np.array([3.0, 0.0, 4.0]), 5.0)
+    row = row_of(book, head_commands=3, lens_commands=2, aim=aim, commanded=(0.1, -0.2, 700.0))
     assert (row.head_commands, row.lens_commands) == (3, 2)
+    assert (row.pan_commanded_deg, row.tilt_commanded_deg) == pytest.approx(np.degrees([0.1, -0.2]))
+    assert (row.focal_commanded_px, row.depth_m) == (700.0, 4.0)
     assert (row.u_px, row.v_px) == pytest.approx((326 - 692 * 0.04, 235), abs=1e-6)
     assert (row.u_wide_px, row.v_wide_px) == pytest.approx((325, 239), abs=1e-6)
     assert row.range_m == pytest.approx(math.hypot(10, 0.4))
@@ -159,13 +162,13 @@ def test_a_row_says_what_is_so(book):
     assert row.off_target == ""
 
 
-def test_the_detection_is_judged_and_only_where_there_is_one(book):
-    """The filter's middle and its prediction are not the detection; a coasting track has none."""
+def test_the_point_error_is_that_of_a_detection_of_the_tracks_own(book):
+    """The filter's centre is not the detection; a coasting track has no detection."""
     seen = row_of(book, target=track(4, (300, 200), box_px=(325 + 3, 239 - 4)))
     assert seen.track == 4
     assert seen.tpe_px == pytest.approx(5.0, abs=1e-6)
     shared = track(4, (325, 239), box_px=(340, 239), shared=True)
-    for nothing in (track(4, (325, 239), missed=1), shared):  # the box of two is the detection of neither
+    for nothing in (track(4, (325, 239), missed=1), shared):  # a box of two targets is the detection of neither
         row = row_of(book, target=nothing)
         assert row.track == 4
         assert math.isnan(row.tpe_px)
@@ -207,7 +210,7 @@ def moving(request):
     world.close()
 
 
-def test_each_frame_is_judged_at_its_own_time(moving):
+def test_each_frame_is_compared_with_the_truth_at_its_own_time(moving):
     """The clamped cubic is at -0.5, 0 and 0.5 m after 0, 1 and 2 s: u = 325 + f x / 4 in the wide view."""
     focal = moving.config.sim.fixed.focal_px[0]
     moving.rig.clock.sleep_until(2.0)
@@ -220,6 +223,21 @@ def test_each_frame_is_judged_at_its_own_time(moving):
     assert found.u_px == pytest.approx(326 + 692 * 0.5 / 4, abs=1e-6)
     later = row_of(moving, target=track(1, (325, 239), t=2.0))
     assert later.tpe_px == pytest.approx(focal * 0.5 / 4, abs=1e-6)
+
+
+def test_a_row_holds_the_true_angles_of_the_head(moving):
+    pan, tilt = moving.rig.head.move(0.1, -0.2, wait=True)
+    assert (pan, tilt) == pytest.approx((0.1, -0.2), abs=moving.rig.head.limits.step)
+    row = row_of(moving)
+    assert (row.pan_deg, row.tilt_deg) == pytest.approx((math.degrees(pan), math.degrees(tilt)))
+
+
+@pytest.mark.parametrize(("dimension", "axis"), [("width", 0), ("height", 1)])
+def test_the_size_is_that_of_the_targets_dimension(book, dimension, axis):
+    target = dataclasses.replace(book.config.target("book"), dimension=dimension)
+    sides = book.truth().silhouette("book", "zoom", 0.0).size_px
+    assert sides[0] != sides[1]
+    assert closeup_of(book.truth(), "book", target, 0.0).size_px == sides[axis]
 
 
 @pytest.mark.parametrize("moving", [8], indirect=True)
@@ -254,7 +272,7 @@ SIDE_PARTS, MIDDLE_PARTS = 8, 8
     (0.02, SIDE_PARTS + MIDDLE_PARTS),
     (1.0, 2 * SIDE_PARTS + MIDDLE_PARTS),
 ])  # fmt: skip
-def test_what_a_wall_hides_is_counted_in_parts(tmp_path, edge, hidden):
+def test_visibility_counts_the_parts_that_a_wall_hides(tmp_path, edge, hidden):
     """A person 10 m ahead faces the camera; a wall at 5 m reaches from the left to ``edge`` [m]."""
     scene = tmp_path / "wall.xml"
     scene.write_text(WALL.format(x=edge - 2))

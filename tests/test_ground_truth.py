@@ -1,4 +1,4 @@
-"""What a pipeline may be told by the truth: detections with noise."""
+"""The truth with noise, which stands in for detector and finder."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 
 from cotarget.errors import ConfigError
 from cotarget.estimation.zoom_matching import Expected
-from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, counted, seeded, true_calibration
+from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, counted, true_calibration
 from cotarget.rig import Frame
 from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.world import SimWorld
@@ -18,12 +18,11 @@ TIMES = np.arange(0.0, SECONDS + STEP / 2, STEP)
 ALIKE = 0.3  # correlation of 200 pairs: four standard deviations of what chance makes
 
 
-@pytest.mark.parametrize("numbers", [seeded, counted])
-def test_the_truth_detector_errs_as_it_is_told(numbers):
+def test_the_truth_detector_has_the_errors_of_its_noise():
     noise = TruthNoise(center_px=0.7, size=0.1, miss=0.2)
     with (w := SimWorld(hold_config("bird", 3), rendered=())).rig:
         truth, image = w.truth(), np.zeros((480, 640, 3), np.uint8)
-        detector, again = (TruthDetector(truth, 5, noise, numbers=numbers) for _ in range(2))
+        detector, again = (TruthDetector(truth, 5, noise) for _ in range(2))
         offs, sides, missed = [], [], 0
         for t in TIMES:
             low, high = truth.box("bird", "fixed", t)
@@ -47,11 +46,11 @@ def test_the_truth_detector_errs_as_it_is_told(numbers):
         assert exact.size_px == pytest.approx(high - low)
 
 
-def test_the_truth_detector_sees_what_the_picture_cuts():
+def test_the_truth_detector_clips_boxes_at_the_border():
     with (w := SimWorld(five_targets_config(0), rendered=())).rig:
         detector = TruthDetector(w.truth(), 0, TruthNoise(0.0, 0.0, 0.0))
         image = np.zeros((480, 640, 3), np.uint8)
-        assert detector.detect(Frame(image, 0.0)) == []  # nobody there yet
+        assert detector.detect(Frame(image, 0.0)) == []  # no target is there yet
         found = [d for t in TIMES[::5] for d in detector.detect(Frame(image, t))]
         assert any(d.clipped for d in found)
         for d in found:
@@ -59,7 +58,7 @@ def test_the_truth_detector_sees_what_the_picture_cuts():
             assert (d.center_px + d.size_px / 2 <= [639.5 + 1e-9, 479.5 + 1e-9]).all()
 
 
-def test_the_truth_finder_finds_where_it_is_told_to_look():
+def test_the_truth_finder_finds_a_target_within_the_gate_alone():
     with (w := SimWorld(hold_config("book", 0), rendered=())).rig:
         truth, calibration = w.truth(), true_calibration(w)
         target = w.config.target("book")
@@ -90,41 +89,25 @@ def test_a_finder_errs_independently_of_a_detector_of_its_seed():
         frame = Frame(np.zeros((480, 640, 3), np.uint8), 1.0)
         found = np.array([each.find(frame, expected).center_px for each in finders])
         noise = TruthNoise(center_px=1.0, size=0.0, miss=0.0)
-        for numbers in (seeded, counted):
-            detectors = [TruthDetector(truth, seed, noise, numbers=numbers) for seed in range(200)]
-            detected = np.array([each.detect(frame)[0].center_px for each in detectors])
-            alike = np.corrcoef(found.T, detected.T)[:2, 2:]
-            assert np.abs(alike).max() < ALIKE
+        detected = np.array([TruthDetector(truth, seed, noise).detect(frame)[0].center_px for seed in range(200)])
+        assert np.abs(np.corrcoef(found.T, detected.T)[:2, 2:]).max() < ALIKE
 
 
-def test_seeded_detections_are_those_of_a_generator_of_the_seed_and_the_microsecond():
-    """So figures that were made with them stay what they are."""
-    with (w := SimWorld(hold_config("bird", 3), rendered=())).rig:
-        truth, frame = w.truth(), Frame(np.zeros((480, 640, 3), np.uint8), 1.24)
-        exact, off = (
-            TruthDetector(truth, 5, TruthNoise(*noise, miss=0.0)).detect(frame)[0] for noise in ((0.0, 0.0), (0.7, 0.1))
-        )
-        rng = np.random.default_rng((5, 1_240_000))
-        assert off.center_px == pytest.approx(exact.center_px + 0.7 * rng.normal(size=2), abs=1e-12)
-        assert off.size_px == pytest.approx(exact.size_px * (1 + 0.1 * rng.normal(size=2)), abs=1e-12)
-
-
-@pytest.mark.parametrize("numbers", [seeded, counted])
-def test_numbers_of_a_time_are_the_same_in_any_order_and_others_at_any_other(numbers):
+def test_the_random_numbers_of_a_time_do_not_depend_on_the_order_of_requests():
     def draw(at, t):
         rng = at(t)
         return (*rng.normal(size=3).tolist(), rng.integers(9), rng.random())  # half a number may be left over
 
     times = [0.0, 1e-6, 2e-6, 0.04, 19.96]  # of neighbouring microseconds none has another's further numbers
-    at, again = numbers(7), numbers(7)
+    at, again = counted(7), counted(7)
     drawn = {t: draw(at, t) for t in times}
     assert {t: draw(again, t) for t in reversed(times)} == {t: drawn[t] for t in reversed(times)}
-    drawn |= {("another seed", t): draw(numbers(8), t) for t in times}
+    drawn |= {("another seed", t): draw(counted(8), t) for t in times}
     values = [value for each in drawn.values() for value in (*each[:3], each[4])]
     assert len(set(values)) == len(values)
 
 
-def test_what_is_no_noise_is_refused():
+def test_impossible_noise_is_refused():
     with pytest.raises(ConfigError, match=r"noise.miss: 1.5 is not within 0 to 1"):
         TruthNoise(miss=1.5)
     for bad in (-0.1, math.nan, math.inf, "much"):

@@ -1,4 +1,4 @@
-"""Every field of Score from rows made by hand; the table on disk."""
+"""Scores of rows made by hand, and the table on disk."""
 
 import dataclasses
 import math
@@ -76,7 +76,7 @@ def test_a_perfect_run():
     )
 
 
-def test_the_clock_starts_when_the_target_is_wholly_in_the_wide_view_and_2_s_have_passed():
+def test_counting_starts_with_the_target_wholly_in_the_fixed_view_after_2_s():
     late = score(run((100, {"in_wide": False, **AWAY}), (25, AWAY), (75, {})))
     assert late.frames == 100  # it may leave the wide view again; what counts is the first time
     assert late.time_to_acquire_s == pytest.approx(25 * PERIOD, abs=EXACT)
@@ -94,7 +94,7 @@ def test_the_2_s_are_counted_from_the_first_row_on():
     assert score(rows).frames == 70
 
 
-def test_acquisition_is_dated_to_the_start_of_the_first_half_second_on_end():
+def test_acquisition_is_at_the_start_of_the_first_half_second_in_frame():
     """12 rows in frame span 0.44 s and do not count; the next ones, from row 90 on, do."""
     found = score(run((60, AWAY), (12, {}), (18, AWAY), (30, {})))
     assert found.time_to_acquire_s == pytest.approx((90 - 50) * PERIOD, abs=EXACT)
@@ -119,7 +119,7 @@ def test_lost_frames_count():
     assert mostly.tpo_width_median == pytest.approx(HALF_DIAGONAL / 640)
 
 
-def test_a_frame_with_the_target_behind_the_camera_counts_as_nothing_of_it():
+def test_a_target_behind_the_camera_has_size_0_and_the_largest_offset():
     """30 good frames, then 50 that show nothing of it: of 80 the median is 0, as that of the offset is the worst."""
     behind = {"u_px": math.nan, "v_px": math.nan, "size_px": math.nan, "visible": 0.0}
     found = score(run((50, {}), (30, {}), (50, behind)))
@@ -231,7 +231,7 @@ def test_reversals(pairs, reversals):
     assert score(commanded(*pairs)).reversals_per_min == pytest.approx(reversals / COUNTED_MIN)
 
 
-def test_commands_count_whether_a_goal_changes_or_not():
+def test_commands_to_the_same_goal_count():
     """A command with every row to the same goal, and a lens that was told something with every tenth."""
     rows = [
         dataclasses.replace(row, head_commands=7 + i, lens_commands=1 + i // 10) for i, row in enumerate(run((150, {})))
@@ -309,7 +309,7 @@ def table(edit):
     b"\x00\xff\xfe\x89PNG\r\n",
     b'{"json": 1}\n',
 ])  # fmt: skip
-def test_what_is_no_table_is_refused_in_one_line(tmp_path, content):
+def test_a_file_that_is_no_table_is_refused(tmp_path, content):
     path = tmp_path / "steps.csv"
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=r"steps\.csv: is no steps\.csv") as caught:

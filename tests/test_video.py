@@ -28,7 +28,7 @@ def test_a_film_is_h264_yuv420p_and_reads_back(tmp_path):
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
-        assert "creation_time" not in container.metadata  # nobody said what the time of day was
+        assert "creation_time" not in container.metadata  # its epoch is not set
     with Film(path) as film:
         frames = list(film)
         assert film.size == (162, 122)
@@ -101,7 +101,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize(("name", "codec", "options"), KINDS)
-def test_a_film_that_is_cut_short_is_told(tmp_path, name, codec, options):
+def test_a_film_that_is_cut_short_has_a_shortfall(tmp_path, name, codec, options):
     """Of 2.4 s; the frames up to the cut are those of the whole film."""
     whole, cut = tmp_path / f"whole-{name}", tmp_path / name
     other_film(whole, codec, **options)
@@ -119,7 +119,7 @@ def test_a_film_that_is_cut_short_is_told(tmp_path, name, codec, options):
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.ts", "a.mpg", "a.mov", "a.h264", "a.flv"])
-def test_a_whole_film_is_not_told_short(tmp_path, name):
+def test_a_whole_film_has_no_shortfall(tmp_path, name):
     """What says its length, and what does not or has it estimated; at a rate that slows down too."""
     codec = {"a.mpg": "mpeg1video", "a.flv": "flv"}.get(name, "libx264")
     for empty_from in (None, 30) if name in ("a.mp4", "a.mkv", "a.mov") else (None,):
@@ -129,7 +129,7 @@ def test_a_whole_film_is_not_told_short(tmp_path, name):
             assert film.shortfall == ""
 
 
-def test_sound_that_goes_on_makes_no_film_short(tmp_path):
+def test_a_sound_track_longer_than_the_pictures_is_no_shortfall(tmp_path):
     with av.open(str(tmp_path / "a.mkv"), "w") as out:
         pictures, sound = out.add_stream("mjpeg", rate=25), out.add_stream("pcm_s16le", rate=8000)
         pictures.width, pictures.height, pictures.pix_fmt = 64, 48, "yuvj420p"
@@ -144,7 +144,7 @@ def test_sound_that_goes_on_makes_no_film_short(tmp_path):
         assert film.shortfall == ""
 
 
-def test_detect_keeps_what_a_film_has_that_is_cut_short_and_says_so(tmp_path, capsys):
+def test_detect_reports_a_film_that_is_cut_short(tmp_path, capsys):
     other_film(tmp_path / "whole.avi", "mjpeg")
     data = (tmp_path / "whole.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(data[: len(data) * 6 // 10])
@@ -177,7 +177,7 @@ def damaged(whole, path, packets):
     ("a.avi", lambda path: other_film(path, "mpeg4"), False),
     ("b.avi", lambda path: other_film(path, "mjpeg"), False),
 ])  # fmt: skip
-def test_what_follows_a_packet_that_cannot_be_decoded_is_read_under_its_own_number(tmp_path, name, write, reordered):
+def test_frames_after_a_damaged_packet_keep_their_numbers(tmp_path, name, write, reordered):
     """One alone, two in a row, and the last; with B-frames a packet's number is not its frame's."""
     whole = tmp_path / f"whole-{name}"
     write(whole)
@@ -198,7 +198,7 @@ def test_what_follows_a_packet_that_cannot_be_decoded_is_read_under_its_own_numb
         assert 59 in lost or len(lost) == 1 or film.shortfall.startswith(f"{len(lost)} packets")
 
 
-def test_frames_that_an_avi_has_lost_altogether_are_counted(tmp_path):
+def test_frames_missing_from_an_avi_are_counted(tmp_path):
     """What FFmpeg passes over for want of a chunk's name becomes no packet, nor leaves a gap in time."""
     other_film(tmp_path / "whole.avi", "mjpeg")
     with av.open(str(tmp_path / "whole.avi")) as film:
@@ -219,7 +219,7 @@ def test_frames_that_an_avi_has_lost_altogether_are_counted(tmp_path):
 
 
 @pytest.mark.parametrize("codec", ["mpeg4", "mjpeg"])
-def test_an_avi_whose_frames_come_seldom_is_whole(tmp_path, codec):
+def test_an_avi_with_empty_chunks_has_no_shortfall(tmp_path, codec):
     """Where none comes a chunk is empty, and counts as a frame of those that the file says it has."""
     other_film(tmp_path / "a.avi", codec, empty_from=20)
     with Film(tmp_path / "a.avi") as film:
@@ -228,7 +228,7 @@ def test_an_avi_whose_frames_come_seldom_is_whole(tmp_path, codec):
     assert times == pytest.approx([i / RATE for i in range(60) if i < 20 or i % 10 == 0], abs=1e-3)
 
 
-def test_a_damaged_film_that_ends_early_too_says_both(tmp_path):
+def test_damage_and_an_early_end_are_both_reported(tmp_path):
     other_film(tmp_path / "whole.avi", "mjpeg")
     damaged(tmp_path / "whole.avi", tmp_path / "a.avi", [5])
     data = (tmp_path / "a.avi").read_bytes()
@@ -240,7 +240,7 @@ def test_a_damaged_film_that_ends_early_too_says_both(tmp_path):
     assert end.startswith("the film says that it lasts 2.4 s, and ends at 1.")
 
 
-def test_detect_goes_on_behind_damage_and_blames_no_labels(tmp_path, capsys):
+def test_detect_continues_after_damage_and_counts_labels_beyond_the_end(tmp_path, capsys):
     other_film(tmp_path / "whole.avi", "mjpeg")
     labels = tmp_path / "labels.csv"
     labels.write_text("frame,x_px,y_px,width_px,height_px\n" + "".join(f"{i},5,5,9,9\n" for i in (10, 59, 60)))
@@ -256,7 +256,7 @@ def test_detect_goes_on_behind_damage_and_blames_no_labels(tmp_path, capsys):
         assert ("is not whole" in err) == bool(lost)
 
 
-def test_a_size_that_changes_on_the_way_is_named(tmp_path):
+def test_a_film_whose_size_changes_is_refused(tmp_path):
     path = tmp_path / "two.mjpeg"
     for width in (64, 96):
         picture = cv2.imencode(".jpg", np.full((48, width, 3), 128, np.uint8))[1].tobytes()
@@ -295,7 +295,7 @@ def test_run_on_film(tmp_path):
     assert (np.abs(last - before).max(axis=2) > 60).sum() > 40  # a box, a number and a trail are there
 
 
-def test_a_run_that_fails_keeps_the_old_table_and_no_film_is_its_own_result(tmp_path):
+def test_a_failed_run_keeps_the_old_table_and_no_film_is_overwritten(tmp_path):
     table = tmp_path / "a.csv"
     table.write_text("old")
     bird_film(tmp_path / "a.mp4", 5)

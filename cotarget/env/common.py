@@ -24,7 +24,7 @@ from cotarget.config import (
     check_config,
 )
 from cotarget.errors import ConfigError, choices
-from cotarget.evaluation import TruthDetector, TruthNoise, counted, true_calibration
+from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.geometry import Array
 from cotarget.rig import READ_TIMEOUT_S, PanTiltState, ZoomState
 from cotarget.schema import Size
@@ -270,7 +270,7 @@ class Episode:
         self.world = SimWorld(config, rendered=())
         self.rig, self.truth = self.world.rig, self.world.truth()
         self.outlines = Outlines(self.truth, still=not has_clutter(config.sim))
-        self.detector = TruthDetector(self.outlines, config.sim.seed, noise, numbers=counted)
+        self.detector = TruthDetector(self.outlines, config.sim.seed, noise)
         fixed = self.truth.T_world_fixed
         self._eye, self._to_fixed = fixed.translation, fixed.rotation.as_matrix().T
 

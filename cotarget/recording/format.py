@@ -1,4 +1,4 @@
-"""The folder of a recorded run: format, writing and reading of events.
+"""Format of a recorded run's folder: write and parse events, read a recording.
 
     recording.json         schema, versions, when, target, whom, config; written after the next two, before the log
     calibration.json       byte-for-byte copy of the run's calibration
@@ -8,7 +8,7 @@
     fixed/ and zoom/       frames as PNG, numbered; the line that names an image is written after the image is complete
 
 If the program dies at any moment, the log is whole except for its last line, and every image that it names is on disk.
-The last line of a run that ended in order, or by an error, is an `end`. `open_recording` reads as much as is whole.
+The last line of a run that ended in order, or by an error, is an `end`.
 """
 
 import dataclasses
@@ -80,7 +80,7 @@ class Event:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The result as floats; a frame's one is its exposure time [s]."""
+        """Result as floats; that of a frame is its exposure time [s]."""
         return tuple(float(value or 0.0) for value in self.result)
 
 
@@ -143,7 +143,7 @@ def parse_event(row: Mapping[str, Any]) -> Event:
     if (failure := row.get("error")) is not None:
         name, message = failure
         error = str(name), str(message)
-    args, result = (tuple(_number(value) for value in row.get(key, ())) for key in ("args", "result"))
+    args, result = (tuple(map(_number, row.get(key, ()))) for key in ("args", "result"))
     arities, numbers = CALLS[call]
     if len(args) not in arities or len(result) != (0 if error else numbers) or None in result:
         raise ValueError(f"{call} has other numbers")
@@ -159,7 +159,7 @@ def parse_event(row: Mapping[str, Any]) -> Event:
 
 
 def spec_table(spec: RigSpec) -> dict[str, Any]:
-    """Write what a rig knows of itself as a JSON object."""
+    """Write a rig's spec as a JSON object."""
     fixed, zoom, limits = spec.fixed, spec.zoom, spec.head.limits
     return {
         "fixed_size": list(fixed.size),
@@ -183,16 +183,10 @@ def spec_table(spec: RigSpec) -> dict[str, Any]:
 
 
 def parse_spec(table: Mapping[str, Any], described: Callable[[], RigSpec]) -> RigSpec:
-    """Parse what a rig knows of itself.
-
-    Args:
-        table: the JSON object.
-        described: gives rates, latencies and delays, which an earlier version did not record, by the configuration.
+    """Parse a rig's spec; ``described`` gives rates and delays, which an earlier version did not record.
 
     Raises:
-        KeyError: a key is missing.
-        TypeError, ValueError: a value has the wrong type.
-        ConfigError: as ``described`` raises it.
+        KeyError, TypeError, ValueError: a key is missing, or a value is wrong.
     """
 
     def pair(key: str) -> tuple[float, float]:
@@ -253,7 +247,7 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
 
 
 def _plain(value: Number) -> Any:
-    """Convert a number for JSON: infinity, which unlimited heads have, becomes a text that `float` reads."""
+    """Convert a number for JSON; infinity, which unlimited heads have, becomes a text that `float` reads."""
     if value is None or isinstance(value, bool):
         return value
     return float(value) if math.isfinite(value) else str(float(value))
@@ -281,15 +275,15 @@ class Recording:
 
     Attributes:
         directory: folder of the recording.
-        config: of the recorded rig, with that rig's backend.
+        config: configuration of the recorded rig.
         calibration: path of the run's calibration.json.
-        target: name of the target that was followed.
-        selector_table: which of several targets, see `cotarget.control.selection`; empty in older recordings.
-        spec: what the rig knew of itself; its head's limits are the device's own.
+        target: name of the followed target.
+        selector_table: selection among several targets, see `cotarget.control.selection`; empty in older recordings.
+        spec: spec of the recorded rig, with the head's own limits.
         events: every call on the rig, in order.
         ending: "complete", the error that ended the run, or where a truncated log breaks off.
         truncated: whether the log has no end; then the last step, which may be incomplete, is left out.
-        notes: one line each for the user.
+        notes: remarks for the user, one line each.
     """
 
     directory: Path
@@ -325,7 +319,7 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
 
     Args:
         directory: folder of the recording.
-        describe: gives the spec of a configured rig, for what an earlier version did not record.
+        describe: gives the spec of a configured rig, for rates and delays that an earlier version did not record.
 
     Raises:
         ConfigError: the folder is no recording, has another schema, or holds nothing that can be replayed.
@@ -378,7 +372,7 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
 
 
 def read_spec(directory: Path, describe: Callable[[RigConfig], RigSpec]) -> RigSpec:
-    """Read only what the recorded rig knew of itself; the arguments are those of `read_recording`.
+    """Read the recorded rig's spec alone; arguments as for `read_recording`.
 
     Raises:
         ConfigError: the folder is no recording, has another schema, or does not say it.
@@ -392,7 +386,7 @@ def read_spec(directory: Path, describe: Callable[[RigConfig], RigSpec]) -> RigS
 
 
 class _DamageError(Exception):
-    """The log is not whole from here on."""
+    """The log is not whole from a line on."""
 
 
 def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, dict[str, Any], RigConfig]:

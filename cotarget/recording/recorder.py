@@ -1,8 +1,7 @@
 """Record a run: a table of its Steps, and every call on its rig with the result.
 
-`step_row` makes its lines. `Recorder` makes the folder of a recording and gives the rig devices that log calls and
-results in order and change neither. `RecordWriter` writes log and images on a thread of its own, so that the
-run does not wait for the disk.
+`step_row` makes a line of the table. `Recorder` makes the folder of a recording, and wraps a rig's devices to log their
+calls. `RecordWriter` writes log and images on its own thread, so that the run does not wait for the disk.
 """
 
 import collections
@@ -49,14 +48,14 @@ from cotarget.recording.format import (
 from cotarget.rig import Board, Camera, Clock, Frame, Image, PanTilt, Rig, ZoomCamera
 
 log = logging.getLogger(__name__)
+
 # The log and its images
 
 # Images that may wait for the disk [bytes]; one of 640x480 takes 0.92 MB. Beyond this, frames of the zoom camera are
 # logged without their image. The fixed camera's images are always kept: a replay needs them, so the run waits.
 ZOOM_ROOM = 64_000_000
 ROOM = 128_000_000
-# Huffman coding alone, because noise has no repetitions, and the one useful filter: a noisy 640x480 image takes 6 ms
-# and 375 kB. Measurements: docs/design-notes.md.
+# Huffman coding alone, because noise has no repetitions, and the one useful filter; see docs/design-notes.md.
 PNG_OPTIONS = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
 if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # older versions of OpenCV always use that filter
     PNG_OPTIONS += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
@@ -81,11 +80,7 @@ class RecordWriter:
     """
 
     def __init__(self, directory: Path) -> None:
-        """Begin the log in a folder.
-
-        Raises:
-            OSError: the folder cannot be written.
-        """
+        """Begin the log in a folder; raise OSError if that cannot be written."""
         self.dropped = 0
         self.failure = ""
         self._directory = directory
@@ -102,13 +97,7 @@ class RecordWriter:
         self._thread.start()
 
     def put(self, event: Event | dict[str, Any], camera: str = "", image: Image | None = None) -> None:
-        """Queue a line of the log: an event or another object; an image is that of the event's frame.
-
-        Args:
-            event: the line.
-            camera: folder of the image.
-            image: (H, W, 3) BGR; it must not change any more.
-        """
+        """Queue a line of the log; the image of an event's frame goes to the camera's folder and must not change."""
         with self._changed:
             picture = None
             if image is not None and not self.failure:
@@ -132,7 +121,7 @@ class RecordWriter:
         self._log.close()
 
     def _picture(self, camera: str, image: Image, t: float) -> _Picture:
-        """Make the image's file name, or return that of the last image if the frame is the same."""
+        """Make an image's file, or return the last one if the frame is the same."""
         if camera in self._last:
             last_t, last_image, last = self._last[camera]
             if last_t == t and (last_image is image or np.array_equal(last_image, image)):
@@ -204,7 +193,7 @@ PROTOCOLS = {"fixed": Camera, "zoom": ZoomCamera, "head": PanTilt, "clock": Cloc
 
 
 class _CallLog:
-    """Log of the calls on all devices of a rig; the thread that makes it is the run's own."""
+    """Log of the calls on all devices of a rig, made in the run's thread."""
 
     def __init__(self, clock: Clock, writer: RecordWriter) -> None:
         self._clock, self._writer, self._thread = clock, writer, threading.get_ident()
@@ -212,7 +201,7 @@ class _CallLog:
     def call(self, name: str, method: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         """Call a device, and log the result or the error; a frame is logged with its image."""
         aside = threading.get_ident() != self._thread
-        if aside and name == "clock.now":  # a watchdog reads the clock all the time
+        if aside and name == "clock.now":  # the watchdog's thread reads the clock all the time
             return method()
         args = argument_numbers(name, arguments)
         try:
@@ -230,7 +219,7 @@ class _CallLog:
 
 
 class _LoggedDevice:
-    """A device whose calls in `CALLS` are logged; everything else is the device's own."""
+    """A device whose calls in `CALLS` are logged; other attributes are the device's."""
 
     def __init__(self, name: str, device: Any, log: _CallLog) -> None:
         self._device = device
@@ -259,14 +248,6 @@ def known_class(error: Exception) -> str:
     return "" if known in (None, type(error)) else known.__name__
 
 
-def _logged(rig: Rig, writer: RecordWriter) -> Rig:
-    """Return the rig with devices that log every call and its result."""
-    writer.put({"rig": spec_table(rig.spec)})
-    calls = _CallLog(rig.clock, writer)
-    devices: dict[str, Any] = {name: _LoggedDevice(name, getattr(rig, name), calls) for name in PROTOCOLS}
-    return replace(rig, **devices)
-
-
 # Steps and the recording's folder
 
 COLUMNS = (
@@ -284,10 +265,7 @@ def utc_text(epoch: datetime, t: float) -> str:
 def step_row(step: Step, epoch: datetime | None = None) -> list[object]:
     """Make a Step's line of the table with `COLUMNS`.
 
-    Args:
-        step: the Step.
-        epoch: wall-clock time at which the rig's clock showed 0, for the column ``utc``; None if the rig's time is
-            simulated, and the column stays empty.
+    The column ``utc`` is empty without ``epoch``, the wall-clock time at which the rig's clock showed 0.
     """
     track, aim, (pan, tilt, focal) = step.target, step.aim, step.commanded
     box = ["", "", "", "", ""] if track is None else [track.id, *track.center_px, *track.size_px]
@@ -361,7 +339,7 @@ class Recorder:
         return self._writer.waiting
 
     def wrap(self, rig: Rig) -> Rig:
-        """Return the one rig of this recording with devices that log every call, and its result, and change neither.
+        """Return the rig with devices that log every call and its result; only one rig is recorded.
 
         Closing it closes the rig, as does a failure here.
 
@@ -375,7 +353,10 @@ class Recorder:
             )
         self._wrapped = True
         try:
-            return _logged(rig, self._writer)
+            self._writer.put({"rig": spec_table(rig.spec)})
+            calls = _CallLog(rig.clock, self._writer)
+            devices: dict[str, Any] = {name: _LoggedDevice(name, getattr(rig, name), calls) for name in PROTOCOLS}
+            return replace(rig, **devices)
         except BaseException:
             rig.close()
             raise

@@ -4,7 +4,7 @@ A run that makes the recorded calls in the recorded order gets exactly the recor
 the last bit. A run that differs still gets the fixed camera's frames in order; every other call is matched with the
 recorded calls between the same two frames, and a call without a match is answered by the time on the recording's clock.
 
-Commands move nothing: they are compared with the recorded ones (`Differences`), and the head moves as recorded.
+Commands move nothing: they are compared with the recorded ones (`Differences`), and the head is where it was recorded.
 """
 
 import math
@@ -85,8 +85,8 @@ class Differences:
 class _Span:
     """Recorded calls from one frame of the fixed camera to the next, in a queue for each kind of call.
 
-    A reading of the clock keeps its place between two other calls and is replayed only there. A run that reads the
-    clock more or less often than the recorded one therefore has the right time again at its next other call.
+    A reading of the clock is replayed only between the same two other calls. So a run that reads the clock more or less
+    often than the recorded one has the right time again at its next other call.
     """
 
     def __init__(self) -> None:
@@ -125,15 +125,14 @@ class Replay:
 
     Attributes:
         now: the replay's clock [s].
-        differences: between the commands so far and the recorded ones; recorded commands after the newest frame do not
-            count as missing yet.
+        differences: of the commands so far; recorded commands after the newest frame do not count as missing yet.
     """
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._spans, self._frames = _cut(recording.events)
-        self._differing: set[int] = set()  # places of the frames whose commands differ,
-        self._first: int | None = None  # and the first of them
+        self._differing: set[int] = set()  # places of the frames whose commands differ
+        self._first: int | None = None  # the first of them
         self._broke_off = not recording.truncated and recording.ending != COMPLETE
         self._index = 0
         self._ended = False
@@ -143,7 +142,7 @@ class Replay:
 
     @cached_property
     def rig(self) -> Rig:
-        """The recording as a rig, see the module's docstring; there is nothing to release."""
+        """The recording as a rig."""
         recording = self._recording
         return Rig(
             fixed=_FixedCamera(self, recording.directory, recording.spec.fixed.size),
@@ -158,7 +157,7 @@ class Replay:
 
     @property
     def is_aside(self) -> bool:
-        """Whether another thread than the run's own calls, such as a watchdog; it is answered by time."""
+        """Whether another thread than the run's calls, such as the watchdog's; it is answered by time."""
         return threading.get_ident() != self._thread
 
     @property
@@ -203,10 +202,6 @@ class Replay:
 
     def next_frame(self, newer_than: float | None, timeout: float) -> Event:
         """Return the next frame of the fixed camera; the newest at this time if the replay has fallen behind.
-
-        Args:
-            newer_than: exposed after this time [s].
-            timeout: how long to wait [s].
 
         Raises:
             RecordingEndedError: there are no more frames.
@@ -296,10 +291,7 @@ class Replay:
 
 
 def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
-    """Cut events into spans between frames; return spans and frames.
-
-    The first span comes before any frame. Calls of other threads are left out.
-    """
+    """Return the spans between frames, the first before any, and the frames; calls of other threads are left out."""
     spans, frames = [_Span()], []
     for event in events:
         if event.aside:
@@ -313,7 +305,7 @@ def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
 
 
 def _recorded_error(name: str, message: str, error_class: str) -> CotargetError:
-    """Make the recorded exception, by its nearest class in `cotarget.errors`; without one it is a DeviceError."""
+    """Make the recorded exception by its nearest class in `cotarget.errors`, or a DeviceError."""
     kind = getattr(cotarget.errors, error_class or name, None)
     if isinstance(kind, type) and issubclass(kind, CotargetError):
         return kind(message)
@@ -324,9 +316,9 @@ T = TypeVar("T")
 
 
 def until_end(steps: Iterable[T], replay: Replay | None = None) -> Iterator[T]:
-    """Yield the steps of a run on a replayed rig, until the recording ends.
+    """Yield the steps of a run on a replayed rig until the recording ends.
 
-    With ``replay`` the error that ended the recorded run is its end too.
+    With ``replay``, the error that ended the recorded run ends this one without being raised.
     """
     try:
         yield from steps

@@ -1,7 +1,7 @@
-"""A rig with the safety layer in front: limits, watchdog, emergency stop, and a halt at every exit.
+"""Put the safety layer in front of a rig: limits, watchdog, emergency stop, and a halt at every exit.
 
-The devices keep their Protocols and refuse what is unsafe. A rig in real time has a watchdog thread. In the simulation
-time passes only inside calls, so each call runs the watchdog, and a long call is split where the watchdog is due.
+The devices keep their Protocols and refuse unsafe commands and frames. A rig in real time has a watchdog thread. In the
+simulation time passes only inside calls, so each call runs the watchdog, and a long one is split where that is due.
 """
 
 import atexit
@@ -31,9 +31,8 @@ from cotarget.safety.watchdog import Watchdog, Watcher
 
 log = logging.getLogger(__name__)
 
-# A loaded unit may take longer than its speed and acceleration give, by this factor.
-SLOWNESS = 1.5
-FINE = 1e-9  # rounding error of an angle [rad]
+SLOWNESS = 1.5  # factor by which a loaded unit may take longer than its speed and acceleration give
+ANGLE_ROUNDING = 1e-9  # [rad]
 
 
 class SafeHead:
@@ -64,7 +63,7 @@ class SafeHead:
         pan, tilt = clipped(pan, tilt, self._limits)
         speeds = self._limits.capped(speed)
         asked: Speed | None = speeds
-        if speeds[0] == speeds[1]:
+        if speeds[0] == speeds[1]:  # a driver need not know of a speed for each axis
             asked = None if math.isinf(speeds[0]) else speeds[0]
         motion = self._watchdog.begin((pan, tilt), self._patience((pan, tilt), min(speeds)) if wait else 0.0)
         try:
@@ -102,7 +101,7 @@ class SafeHead:
 
 def _inside(angle: float, bounds: tuple[float, float], limits: PanTiltLimits) -> bool:
     """Return whether an angle is within bounds, with a tolerance of one step; nan is not."""
-    slack = limits.step + FINE
+    slack = limits.step + ANGLE_ROUNDING
     return bounds[0] - slack <= angle <= bounds[1] + slack
 
 
@@ -134,15 +133,11 @@ class SafeCamera:
             )
         if newer_than is not None and not frame.t > newer_than:
             raise StaleFrameError(f"the {self._name} camera gave a frame of {frame.t:.3f} s for one after that time")
-        self.accept(frame, now)
+        self._accept(frame, now)
         return frame
 
-    def accept(self, frame: Frame, now: float) -> None:
-        """Check a frame that was read at ``now`` [s]; one newer than all before is a sign of life.
-
-        Raises:
-            StaleFrameError: the frame is from the future.
-        """
+    def _accept(self, frame: Frame, now: float) -> None:
+        """Refuse a frame from the future; one newer than all before is a sign of life at ``now`` [s]."""
         ahead = frame.t - now
         if not ahead <= FUTURE_S:
             raise StaleFrameError(
@@ -154,6 +149,7 @@ class SafeCamera:
             self._watchdog.alive(now)
 
     def _read(self, newer_than: float | None, timeout: float) -> Frame:
+        """Read a frame; without a watchdog thread, interrupt the wait where the watchdog is due."""
         if self._watchdog.threaded:
             return self._camera.read(newer_than, timeout)
         self._watchdog.watch()
@@ -167,38 +163,30 @@ class SafeCamera:
         return self._camera.read(newer_than, timeout)
 
 
-class SafeZoomCamera:
+class SafeZoomCamera(SafeCamera):
     """The zoom camera with checked frames. An emergency stop leaves the lens alone: it moves inside the camera."""
 
-    def __init__(self, camera: ZoomCamera, stream: SafeCamera, clock: Clock) -> None:
-        self._camera, self._stream, self._clock = camera, stream, clock
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) [px]."""
-        return self._camera.size
+    def __init__(self, camera: ZoomCamera, clock: Clock, watchdog: Watchdog, max_age_s: float) -> None:
+        super().__init__(camera, clock, watchdog, max_age_s, "zoom")
+        self._device = camera
 
     @property
     def still_size(self) -> tuple[int, int]:
         """(width, height) of full stills [px]."""
-        return self._camera.still_size
+        return self._device.still_size
 
     @property
     def focal_range(self) -> tuple[float, float]:
         """Shortest and longest focal length [px]."""
-        return self._camera.focal_range
-
-    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Read as `SafeCamera.read` does."""
-        return self._stream.read(newer_than, timeout)
+        return self._device.focal_range
 
     def zoom(self, focal_px: float) -> float:
         """Start the lens moving; return the focal length [px] that it will really reach."""
-        return self._camera.zoom(focal_px)
+        return self._device.zoom(focal_px)
 
     def state(self) -> ZoomState:
         """Return the lens's state now."""
-        return self._camera.state()
+        return self._device.state()
 
     def capture(self) -> Frame:
         """Take a full still. It may be old when it arrives, because it is large, but not older than the request.
@@ -207,10 +195,10 @@ class SafeZoomCamera:
             StaleFrameError: the still is older than the request.
         """
         asked = self._clock.now()
-        frame = self._camera.capture()
+        frame = self._device.capture()
         if not frame.t >= asked - FUTURE_S:
             raise StaleFrameError(f"the still is from {asked - frame.t:.2f} s before it was asked for (zoom camera)")
-        self._stream.accept(frame, self._clock.now())
+        self._accept(frame, self._clock.now())
         return frame
 
 
@@ -235,7 +223,7 @@ class SafeClock:
 
 # Soft limits and speed cap
 
-ROUNDING = 1e-9  # in steps; keeps a limit of whole steps whole after its conversion from degrees
+STEP_ROUNDING = 1e-9  # in steps; keeps a limit of whole steps whole after its conversion from degrees
 
 
 def soft_limits(device: PanTiltLimits, config: SafetyConfig) -> PanTiltLimits:
@@ -253,7 +241,7 @@ def soft_limits(device: PanTiltLimits, config: SafetyConfig) -> PanTiltLimits:
 
 
 def clipped(pan: float, tilt: float, limits: PanTiltLimits) -> tuple[float, float]:
-    """Clip angles to the limits; with steps to the outermost step inside them, so that rounding cannot lead outside.
+    """Clip angles [rad] to the limits, or to the outermost step inside them, so that rounding cannot lead outside.
 
     Raises:
         DeviceError: an angle is not a number.
@@ -285,7 +273,7 @@ def _clip(angle: float, limits: tuple[float, float], step: float) -> float:
 def _outermost(limits: tuple[float, float], step: float) -> tuple[float, float]:
     """Return the outermost steps inside the limits; the limits themselves for a head without steps."""
     if step > 0:
-        return math.ceil(limits[0] / step - ROUNDING) * step, math.floor(limits[1] / step + ROUNDING) * step
+        return math.ceil(limits[0] / step - STEP_ROUNDING) * step, math.floor(limits[1] / step + STEP_ROUNDING) * step
     return limits
 
 
@@ -295,12 +283,11 @@ def _outermost(limits: tuple[float, float], step: float) -> tuple[float, float]:
 def guard(rig: Rig, config: SafetyConfig) -> Rig:
     """Put the safety layer in front of a rig: its head keeps the limits, is watched, and can be stopped.
 
-    A rig in real time is watched by a thread; its head must accept a halt from any thread at any time. Time of any
-    other rig passes only inside calls, and each call runs the watchdog. Closing the guarded rig halts the head, then
-    closes the other.
+    The head of a rig in real time must accept a halt from any thread at any time. Closing the guarded rig halts the
+    head, then closes the rig behind it.
 
     Args:
-        rig: a rig without a safety layer; if this fails for another reason than having one, it is closed.
+        rig: a rig without a safety layer; it is closed if this fails, but for a rig that is guarded already.
         config: limits, times and stop file.
 
     Raises:
@@ -313,15 +300,11 @@ def guard(rig: Rig, config: SafetyConfig) -> Rig:
     try:
         refuse_if_stopped(config.stop_file)
         limits = soft_limits(rig.head.limits, config)
-        watchdog = behind.watchdog
-
-        def checked(camera: Camera, name: str) -> SafeCamera:
-            return SafeCamera(camera, rig.clock, watchdog, config.max_frame_age_s, name)
-
+        watchdog, max_age_s = behind.watchdog, config.max_frame_age_s
         guarded = dataclasses.replace(
             rig,
-            fixed=checked(rig.fixed, "fixed"),
-            zoom=SafeZoomCamera(rig.zoom, checked(rig.zoom, "zoom"), rig.clock),
+            fixed=SafeCamera(rig.fixed, rig.clock, watchdog, max_age_s, "fixed"),
+            zoom=SafeZoomCamera(rig.zoom, rig.clock, watchdog, max_age_s),
             head=SafeHead(rig.head, limits, watchdog),
             clock=rig.clock if rig.spec.real_time else SafeClock(rig.clock, watchdog),
             spec=dataclasses.replace(rig.spec, head=dataclasses.replace(rig.spec.head, limits=limits)),
@@ -337,7 +320,7 @@ def guard(rig: Rig, config: SafetyConfig) -> Rig:
 
 
 class _Guard:
-    """The guard behind a rig: its emergency stop, and its closing with threads, signal handlers and exit hook."""
+    """Emergency stop and closing of a guarded rig, with its threads, signal handlers and exit hook."""
 
     def __init__(self, rig: Rig, config: SafetyConfig) -> None:
         self._rig = rig

@@ -1,4 +1,4 @@
-"""Handle signals that end or suspend the process: the head is halted first, and files are completed."""
+"""Halt the head and complete files before a signal ends or suspends the process."""
 
 import logging
 import os
@@ -21,12 +21,11 @@ SHELL_STATUS = 128  # a shell's exit status for a signal is this plus its number
 def end_politely(halt: Callable[[], None] | None = None) -> Callable[[], None]:
     """Install signal handlers that halt the head before the process ends or is suspended.
 
-    A signal that would end the process raises SystemExit, so that ``with`` blocks are left. A signal that would suspend
-    it does so once the head is halted, and not at all if the halt fails; resumed, the program goes on as after any
-    halt. Handlers that the program has set stay.
+    A signal that would end the process raises SystemExit, so that ``with`` blocks are left. One that would suspend it
+    does so after the head is halted, and not at all if the halt fails. Handlers that the program has set stay.
 
     Args:
-        halt: halts the head, callable from a signal handler; if None, the suspending signals end the process too.
+        halt: halts the head, callable from a signal handler; if None, suspending signals end the process too.
 
     Returns:
         A function that removes the handlers.
@@ -60,8 +59,7 @@ def end_politely(halt: Callable[[], None] | None = None) -> Callable[[], None]:
     return undo
 
 
-# Number of signals that end even a critical section, once that is allowed: a wait for devices or disks without answer.
-IMPATIENCE = 3
+IMPATIENCE = 3  # number of signals that end even a critical section that waits for a device or disk, once allowed
 
 
 class DeferredSignals:

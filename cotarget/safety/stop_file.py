@@ -1,4 +1,4 @@
-"""Emergency stop across processes: while a certain file exists, the head does not move; the file holds the reason."""
+"""Emergency stop across processes by a file: while it exists, the head does not move; it holds the reason."""
 
 import math
 import os
@@ -12,10 +12,8 @@ from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 
 NO_REASON = "no reason given"
 LONGEST_REASON = 200  # shown part of the file's first line [characters]
-
-
 SUFFIX = ".stop"  # of the default stop file
-# Lines of a file that is TOML no more, which still say where the stop file is.
+# Lines of a file that is no valid TOML, which still say where the stop file is.
 STOP_FILE_LINE = r"""^[^#\n]*\bstop_file[ \t]*=[ \t]*(?:(["'])([^"'\n]+)\1|(false)\b)?"""
 HARDWARE_LINE = r"""^[ \t]*backend[ \t]*=[ \t]*["']hardware["']"""
 
@@ -29,8 +27,8 @@ def locate_stop_file(rig: Path, backend: object, said: object) -> Path | None:
         said: its `stop_file`; None where it has none, and False to do without one.
 
     Returns:
-        The path; by default RIG.stop beside rig.toml, or the file that it links to, for real devices, and None for any
-        other rig.
+        The path; None for none. By default a rig of real devices has RIG.stop beside rig.toml, or beside the file that
+        rig.toml links to, and another rig has none.
     """
     if said is None:
         if backend != "hardware":
@@ -40,7 +38,7 @@ def locate_stop_file(rig: Path, backend: object, said: object) -> Path | None:
 
 
 def find_stop_file(rig: Path) -> Path:
-    """Find the stop file of a rig.toml; no other fault of the file keeps a user from stopping the head.
+    """Find the stop file of a rig.toml, even in one that is invalid otherwise.
 
     Raises:
         ConfigError: the file cannot be read, or the rig has no stop file.
@@ -71,8 +69,8 @@ def find_stop_file(rig: Path) -> Path:
 def stop_reason(path: Path | None) -> str | None:
     """Read why the head must not move; None if it may.
 
-    An unreadable file also stops the head, because it may be a stop. Opening a pipe does not block. A file system that
-    hangs blocks this call (see `cotarget.safety.watchdog`).
+    An unreadable file also stops the head, because it may be a stop. Opening a pipe does not block, but a file system
+    that hangs blocks this call (see `StopLook`).
     """
     if path is None:
         return None
@@ -99,9 +97,11 @@ def refuse_if_stopped(path: Path | None) -> None:
         EmergencyStopError: the file exists; the message has the reason, and how to clear it.
         ConfigError: its folder does not exist, or cannot be written.
     """
-    if path is not None and not path.parent.is_dir():
+    if path is None:
+        return
+    if not path.parent.is_dir():
         raise ConfigError(f"{path}: the head could not be stopped by this file: {_no_folder(path)}")
-    if path is not None and not os.access(path.parent, os.W_OK):
+    if not os.access(path.parent, os.W_OK):
         raise ConfigError(
             f"{path}: the head could not be stopped by this file: {path.parent} cannot be written; allow it, or name a "
             "file elsewhere: stop_file in [safety] of rig.toml"
@@ -169,12 +169,10 @@ def clear_stop_file(path: Path) -> str | None:
 # Reading the file from a program that must not wait for it
 
 LOOK_POLL_S = 0.05  # reading the stop file takes well below 1 ms; the answer is awaited in slices of this time [s]
-# After this number of slices without an answer the file counts as a stop. Slices are counted and not timed, so that a
-# suspended machine does not count as an unreadable file.
-MOST_MISSED = 6
-# A command uses an answer no older than this without waiting for a new one; the watchdog halts the head for a file
-# that appears after it [s].
-RECENT_S = 2 * LOOK_POLL_S
+MOST_MISSED = 6  # slices without an answer after which the file counts as a stop; a suspended machine misses none
+RECENT_S = (
+    2 * LOOK_POLL_S
+)  # age up to which a command trusts an answer; the watchdog halts the head for a newer file [s]
 LOOK_JOIN_S = 0.2  # time limit for the thread to end, which a hanging file may block [s]
 
 

@@ -1,9 +1,8 @@
 """The watchdog of a rig: decide whether the head may move, and halt it when it may not.
 
-`Watchdog` keeps the state. Devices, the watchdog's thread (`Watcher`) and the operator call it, each from a thread of
-its own. Its lock is held for bookkeeping only, never during a call of a device, so that a hanging device cannot keep
-another thread from halting the head. `StopLook` reads the stop file on a thread of its own for the same reason: a file
-system may hang.
+Devices, the watchdog's thread (`Watcher`) and the operator call `Watchdog`, each from another thread. Its lock is never
+held during a call of a device, so that a hanging device cannot keep another thread from halting the head. `StopLook`
+reads the stop file on its own thread for the same reason: a file system may hang.
 """
 
 import logging
@@ -17,8 +16,6 @@ from cotarget.rig import Clock, PanTilt, PanTiltState
 from cotarget.safety.stop_file import StopLook, stop_reason, stopped_by_file
 
 log = logging.getLogger(__name__)
-
-# State of the watchdog
 
 HALT_TRIES = 2  # when the rig is closed; the driver limits the time of each
 AT_GOAL = math.radians(0.1)  # a head that rests within this and a step of its goal has arrived [rad]
@@ -42,7 +39,7 @@ class Motion:
 
 
 class Watchdog:
-    """State of a rig's watchdog and emergency stop.
+    """Watchdog and emergency stop of a head.
 
     The head may be moving from a command until a halt, until the device has waited for its arrival, or until a state
     shows it at rest at the goal. In that time there must be a sign of life every ``watchdog_s``: a command, or a frame
@@ -52,7 +49,7 @@ class Watchdog:
         head: the device.
         clock: the rig's clock.
         config: watchdog time and stop file.
-        threaded: whether a thread calls `watch`; otherwise each call on the rig must.
+        threaded: whether a thread calls `watch`; otherwise each call on the rig does.
 
     Attributes:
         logged: why the head could not be halted, as already logged; empty if it could.
@@ -98,8 +95,7 @@ class Watchdog:
         """Register that the device's call has returned, and whether the head has arrived.
 
         Returns:
-            Whether the head was halted during the call. The command may have reached the unit after the halt, so the
-                head is halted again.
+            Whether the head was halted during the call; it is halted again.
         """
         with self._lock:
             interrupted = self._halts != motion.halts
@@ -143,19 +139,19 @@ class Watchdog:
 
     def watch(self) -> None:
         """Halt the head for an overdue sign of life, a stop file, or a halt that failed before."""
-        # First the check without a file system; then the file is awaited no longer than until that check is due again.
+        # First the check without a file system; the file's answer is awaited until that check is due again at the most.
         tried = self._halt_if_overdue()
         if not (self._heed_stop_file(self.pause(math.inf)) or tried):
             self._halt_if_owed()
 
     def _halt_if_overdue(self) -> bool:
         """Halt the head if no sign of life came in time; return whether that was so."""
-        # In this order: read after the last sign of life, a clock that runs forward cannot show an earlier time.
-        alive_at, deadline = self._alive_at, self.deadline()
-        if deadline is None or self._owed is not None:
+        if self._motion is None or self._owed is not None:
             return False
-        now = self._clock.now()
-        if alive_at <= now < deadline:
+        # In this order: a clock that runs forward shows no time before the last sign of life that was read before it,
+        # and a sign of life that comes meanwhile counts.
+        alive_at, now, deadline = self._alive_at, self._clock.now(), self.deadline()
+        if deadline is None or alive_at <= now < deadline:
             return False
         if now < alive_at:
             reason = f"the rig's clock ran backwards by {alive_at - now:.3g} s"
@@ -244,7 +240,7 @@ class Watchdog:
             motion, self._halts = self._motion, self._halts + 1
         try:
             self._head.halt()
-        except Exception as error:  # after any failure the halt must be repeated
+        except Exception as error:
             with self._lock:
                 first, self._owed = self._owed is None, str(error)
             if first and not self._shut:
@@ -282,8 +278,6 @@ class Watchdog:
         if self._owed is not None:
             self._halt()
 
-
-# The watchdog's thread
 
 POLL_S = 0.05  # period of reading the stop file, and of repeating a failed halt [s]
 JOIN_S = 2.0  # time limit for the thread to end: longer than a halt takes [s]

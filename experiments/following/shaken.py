@@ -28,8 +28,8 @@ class Shaken:
             seed: seed of the noise.
             miss: fraction of frames without a detection while the image moves.
         """
-        self._still = TruthDetector(outlines, seed, NOISE, numbers=counted, camera="zoom")
-        self._moving = TruthDetector(outlines, seed, replace(NOISE, miss=miss), numbers=counted, camera="zoom")
+        self._still = TruthDetector(outlines, seed, NOISE, camera="zoom")
+        self._moving = TruthDetector(outlines, seed, replace(NOISE, miss=miss), camera="zoom")
         self._truth, self._miss, self._numbers_at = truth, miss, counted(seed + APART)
 
     def detect(self, frame: Frame) -> list[Detection]:

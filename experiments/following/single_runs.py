@@ -8,7 +8,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetProfile
-from cotarget.evaluation import TruthDetector, TruthFinder, closeup_of, counted, true_calibration
+from cotarget.evaluation import TruthDetector, TruthFinder, closeup_of, true_calibration
 from cotarget.metrics import BACKGROUND_S, ROUNDING_S, WHOLLY_VISIBLE
 from cotarget.metrics import Row as Judged
 from cotarget.pantilt import towards
@@ -103,7 +103,7 @@ def by_pair(
         return TruthFinder(calibration, target, outlines, name, seed, shaken.misses)
 
     settings = FollowSettings(finder=finder)
-    detector = TruthDetector(outlines, seed, NOISE, numbers=counted)
+    detector = TruthDetector(outlines, seed, NOISE)
     for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
         yield step.zoom.t
 

@@ -1,10 +1,11 @@
-"""What a run leaves: the table of Steps, complete or not there at all; and its recording, whole whenever it stops."""
+"""The table of a run's Steps, and its recording, which is whole whenever the run stops."""
 
 import dataclasses
 import errno
 import json
 import math
 import threading
+from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
@@ -13,61 +14,49 @@ import pytest
 
 from cotarget.backends import open_recording
 from cotarget.calibration import load_calibration
-from cotarget.config import DEFAULT_TARGETS, RigConfig, config_table, parse_config
-from cotarget.detection import Detection
+from cotarget.config import DEFAULT_TARGETS, RigConfig, parse_config
 from cotarget.errors import ConfigError, CotargetError, DeviceError
-from cotarget.pipeline import State, Step
+from cotarget.pipeline import State
 from cotarget.recording import recorder as writing
 from cotarget.recording.format import CALLS, Event, event_line, parse_event
 from cotarget.recording.recorder import COLUMNS, Recorder, step_row
 from cotarget.recording.replay import Replay
 from cotarget.rig import Frame, PanTiltState, ZoomState
-from cotarget.targeting import Aim
-from cotarget.tracking.track import Track
 from tests.support.full_disk import SAID, full_disk
 from tests.support.recorded_run import CONFIG, SIZE, ToyDevices, calibration_file, record, run, toy_rig
 from tests.support.rigs import guarded, rig_of
+from tests.support.steps import PICTURE, step
 
-PICTURE = np.zeros((4, 4, 3), np.uint8)
 IMAGE_BYTES = SIZE[0] * SIZE[1] * 3
+FOLLOWED = dataclasses.replace(
+    step(0.5),
+    t=0.56,
+    zoom=Frame(PICTURE, 0.48),
+    commanded=(math.radians(30), math.radians(-20), 4800.0),
+    head=PanTiltState(math.radians(29), math.radians(-19), True, 0.56),
+    lens=ZoomState(4700.0, True, 0.56),
+    skipped=3,
+)
+LOST = dataclasses.replace(
+    FOLLOWED, state=State.LOST, reason='out of sight, says "it"\nfor 0.5 s', target=None, aim=None, tracks=()
+)
 
 
-def step(index=0, found=True):
-    detection = Detection(np.array([10.0, 20.0]), np.array([3.0, 4.0]), 1.0)
-    track = Track(7, 0.5, True, 0, detection.center_px, np.zeros(2), detection.size_px, 4.0, np.eye(4), 1.0, detection)
-    aim = Aim(0.1, 0.2, 5000.0, 4900.0, False, np.array([1.0, 2.0, 10.0]), 10.5)
-    return Step(
-        index=index,
-        t=0.56,
-        state=State.FOLLOWING if found else State.LOST,
-        reason="" if found else 'out of sight, says "it"\nfor 0.5 s',
-        fixed=Frame(PICTURE, 0.5),
-        zoom=Frame(PICTURE, 0.48),
-        mask=None,
-        detections=(detection,) if found else (),
-        tracks=(track,) if found else (),
-        target=track if found else None,
-        aim=aim if found else None,
-        commanded=(math.radians(30), math.radians(-20), 4800.0),
-        head=PanTiltState(math.radians(29), math.radians(-19), True, 0.56),
-        lens=ZoomState(4700.0, True, 0.56),
-    )
-
-
-def test_one_line_a_step():
-    first, second = (dict(zip(COLUMNS, step_row(step(found=found)), strict=True)) for found in (True, False))
-    numbers = {"index": 0, "t_s": 0.56, "t_fixed_s": 0.5, "t_zoom_s": 0.48, "track": 7, "u_px": 10, "v_px": 20,
-               "width_px": 3, "height_px": 4, "depth_m": 10, "range_m": 10.5, "pan_commanded_deg": 30,
+def test_a_step_is_one_row_of_the_table():
+    first = dict(zip(COLUMNS, step_row(FOLLOWED, datetime(2024, 2, 29, tzinfo=UTC)), strict=True))
+    numbers = {"index": 0, "t_s": 0.56, "t_fixed_s": 0.5, "t_zoom_s": 0.48, "track": 1, "u_px": 30, "v_px": 20,
+               "width_px": 8, "height_px": 8, "depth_m": 10, "range_m": 10, "pan_commanded_deg": 30,
                "tilt_commanded_deg": -20, "focal_commanded_px": 4800, "pan_deg": 29, "tilt_deg": -19,
-               "focal_px": 4700}  # fmt: skip
+               "focal_px": 4700, "skipped": 3}  # fmt: skip
     assert {name: float(first[name]) for name in numbers} == pytest.approx(numbers)
-    assert (first["state"], first["reason"], first["utc"]) == ("following", "", "")
-    assert (second["state"], second["reason"]) == ("lost", 'out of sight, says "it"\nfor 0.5 s')
+    assert (first["state"], first["reason"], first["utc"]) == ("following", "", "2024-02-29T00:00:00.500+00:00")
+    second = dict(zip(COLUMNS, step_row(LOST), strict=True))
+    assert (second["state"], second["reason"], second["utc"]) == ("lost", LOST.reason, "")
     assert {second[name] for name in ("track", "u_px", "width_px", "depth_m", "range_m")} == {""}
 
 
 def test_zeros_have_no_sign():
-    row = step_row(dataclasses.replace(step(), commanded=(-0.0, np.float64(-0.0), 4800.0), t=-0.0))
+    row = step_row(dataclasses.replace(FOLLOWED, commanded=(-0.0, np.float64(-0.0), 4800.0), t=-0.0))
     assert [str(row[COLUMNS.index(name)]) for name in ("t_s", "pan_commanded_deg", "tilt_commanded_deg")] == ["0.0"] * 3
 
 
@@ -80,7 +69,7 @@ def rows_of(folder):
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
-def test_a_recording_holds_what_went_through_the_rig(tmp_path, calibration_path):
+def test_a_recording_holds_the_calls_and_frames_of_the_rig(tmp_path, calibration_path):
     """Files that another program can read: PNGs, and JSON lines whose numbers are those of the Steps."""
     steps = record(tmp_path / "run", calibration_path, seconds=0.5)
     folder = tmp_path / "run"
@@ -93,10 +82,10 @@ def test_a_recording_holds_what_went_through_the_rig(tmp_path, calibration_path)
     assert rows[-1] == {"end": "complete", "dropped": 0}
     looks = [row for row in rows if row.get("call") == "fixed.read"]
     assert [row["result"] for row in looks] == [[step.fixed.t] for step in steps]
-    for row, step in zip(looks, steps, strict=True):
+    for row, made in zip(looks, steps, strict=True):
         path = folder / row["image"]
         assert path.stat().st_size == row["bytes"]
-        assert np.array_equal(cv2.imread(str(path)), step.fixed.image)
+        assert np.array_equal(cv2.imread(str(path)), made.fixed.image)
     closeups = [row["image"] for row in rows if row.get("call") == "zoom.read"]
     assert len(closeups) == len(steps)
     assert len(set(closeups)) == len({step.zoom.t for step in steps}) < len(steps)  # a frame seen twice is kept once
@@ -109,7 +98,7 @@ def test_a_recording_holds_what_went_through_the_rig(tmp_path, calibration_path)
     assert "recording" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_every_bit_of_a_number_comes_back():
+def test_events_are_written_and_parsed_to_the_last_bit():
     rng = np.random.default_rng(1)
     for call, (arities, count) in CALLS.items():
         for arity in arities:
@@ -126,31 +115,6 @@ def test_every_bit_of_a_number_comes_back():
     assert parse_event(json.loads(event_line(failed))) == failed
 
 
-TABLES = [
-    {},
-    {"sim": {"scene": "indoor", "targets": ["book"], "seed": 3, "effects": {"all": False, "noise": True},
-             "T_head_zoom": {"translation": [0.1, 0.2, 0.3], "rotvec_deg": [1.0, 2.0, 3.0]}}},
-    {"backend": "hardware", "hardware": {"head": {"port": "/dev/ttyUSB0", "pan_sign": -1},
-     "zoom": {"settings": {"iso": "100"}, "lens": [[0, 6.0], [128, 72.0]]}, "fixed": {"url": "http://10.0.0.1:8080/"}},
-     "safety": {"pan_deg": [-20, 30], "speed_deg_s": 40.0},
-     "targets": {"kite": {"size": 2.0, "dimension": "width", "wanted_px": 99.5, "detector": "motion"}}},
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("table", TABLES)
-def test_a_config_comes_back(table):
-    def plain(value):
-        if dataclasses.is_dataclass(value):
-            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        if hasattr(value, "as_matrix"):
-            return np.round(value.as_matrix(), 12).tolist()  # through degrees and back
-        return {k: plain(v) for k, v in value.items()} if hasattr(value, "items") else value
-
-    config = parse_config(table)
-    text = json.dumps(config_table(config), allow_nan=False)
-    assert plain(parse_config(json.loads(text))) == plain(config)
-
-
 def test_no_password_is_recorded(tmp_path, calibration_path):
     table = {"backend": "hardware", "hardware": {"fixed": {"url": "http://me:secret@10.0.0.1/", "password": "secret"}}}
     with Recorder(tmp_path / "run", parse_config(table), calibration_path, "bird") as recorder:
@@ -159,7 +123,7 @@ def test_no_password_is_recorded(tmp_path, calibration_path):
     assert open_recording(tmp_path / "run").config.hardware.fixed["url"] == "http://10.0.0.1/"
 
 
-def test_the_targets_picture_comes_along(tmp_path, calibration_path):
+def test_the_targets_template_is_copied_into_the_recording(tmp_path, calibration_path):
     picture = tmp_path / "cover.png"
     cv2.imwrite(str(picture), np.full((4, 5, 3), 99, np.uint8))
     book = dataclasses.replace(DEFAULT_TARGETS["book"], template=picture)
@@ -196,7 +160,7 @@ def prepare(tmp_path, what):
     ("", "bird", "none.json", "none.json: "),
     ("", "book", "rig_calibration.json", "nowhere.png: "),
 ])  # fmt: skip
-def test_a_recording_that_cannot_begin_is_refused_in_one_line_and_leaves_nothing(
+def test_a_recording_that_cannot_begin_is_refused_and_leaves_no_files(
     tmp_path, calibration_path, what, target, calibration, named
 ):
     folder = prepare(tmp_path, what)
@@ -211,8 +175,7 @@ def test_a_recording_that_cannot_begin_is_refused_in_one_line_and_leaves_nothing
 
 
 @pytest.mark.parametrize("room", [0, 1000])
-def test_a_full_disk_is_named_by_the_folder_that_is_on_it(tmp_path, calibration_path, room):
-    """And not by the file that is copied there."""
+def test_a_full_disk_at_the_beginning_names_the_recordings_folder(tmp_path, calibration_path, room):
     folder = tmp_path / "run"
     with full_disk(room), pytest.raises(ConfigError, match=rf"run: .*{SAID}"):
         Recorder(folder, CONFIG, calibration_path, "bird")
@@ -220,7 +183,7 @@ def test_a_full_disk_is_named_by_the_folder_that_is_on_it(tmp_path, calibration_
 
 
 @pytest.mark.parametrize("exists", [False, True])
-def test_a_rig_that_cannot_be_opened_leaves_room_for_the_next_try(tmp_path, calibration_path, exists):
+def test_a_recording_of_a_rig_that_cannot_be_opened_is_removed(tmp_path, calibration_path, exists):
     folder = tmp_path / "run"
     if exists:
         folder.mkdir()
@@ -231,7 +194,7 @@ def test_a_rig_that_cannot_be_opened_leaves_room_for_the_next_try(tmp_path, cali
     assert record(folder, calibration_path, seconds=0.1)
 
 
-def test_a_rig_that_says_nothing_of_itself_is_closed(tmp_path, calibration_path):
+def test_a_rig_that_cannot_be_wrapped_is_closed(tmp_path, calibration_path):
     devices = ToyDevices()
     rig = dataclasses.replace(rig_of(devices), spec=None)
     with pytest.raises(AttributeError), Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
@@ -242,7 +205,7 @@ def test_a_rig_that_says_nothing_of_itself_is_closed(tmp_path, calibration_path)
 
 
 def test_a_guarded_rig_is_not_recorded(tmp_path, calibration_path):
-    """The log would lack what the guard commands."""
+    """The log would lack the commands of the guard."""
     devices = ToyDevices()
     with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
         with guarded(devices, CONFIG.safety) as safe, pytest.raises(ConfigError, match="guarded"):
@@ -252,7 +215,7 @@ def test_a_guarded_rig_is_not_recorded(tmp_path, calibration_path):
 
 
 class Jammed:
-    """A disk that takes nothing until it is let go."""
+    """A disk that writes no image until `free` is set."""
 
     def __init__(self, monkeypatch):
         self.free, self.begun = threading.Event(), threading.Event()
@@ -266,7 +229,7 @@ class Jammed:
         monkeypatch.setattr(writing, "write_png", wait_and_write)
 
 
-def test_a_slow_disk_costs_closeups_and_says_how_many(tmp_path, calibration_path, monkeypatch, caplog):
+def test_a_slow_disk_drops_and_counts_images_of_the_zoom_camera_alone(tmp_path, calibration_path, monkeypatch, caplog):
     """The zoom camera's images stay out, and the fixed camera's are all there; the run is the same to the last bit."""
     disk = Jammed(monkeypatch)
     monkeypatch.setattr(writing, "ZOOM_ROOM", 4 * IMAGE_BYTES)
@@ -288,7 +251,7 @@ def test_a_slow_disk_costs_closeups_and_says_how_many(tmp_path, calibration_path
     assert played.differences.same
 
 
-def test_a_run_waits_for_a_disk_that_has_no_room_for_the_fixed_cameras_images(tmp_path, calibration_path, monkeypatch):
+def test_a_run_waits_for_the_disk_to_take_the_fixed_cameras_images(tmp_path, calibration_path, monkeypatch):
     disk = Jammed(monkeypatch)
     monkeypatch.setattr(writing, "ROOM", 3 * IMAGE_BYTES)
     monkeypatch.setattr(writing, "ZOOM_ROOM", 0)
@@ -311,7 +274,7 @@ def test_a_run_waits_for_a_disk_that_has_no_room_for_the_fixed_cameras_images(tm
     assert open_recording(tmp_path / "run").steps == len(steps)
 
 
-def test_a_full_disk_does_not_stop_the_run_but_is_told(tmp_path, calibration_path, monkeypatch, caplog):
+def test_a_full_disk_ends_the_recording_but_not_the_run(tmp_path, calibration_path, monkeypatch, caplog):
     write = writing.write_png
 
     def fill_up(path, image):

@@ -1,4 +1,4 @@
-"""Replays: the same to the last bit, sensible where the pipeline has changed, and as far as a folder is whole."""
+"""Replays: bit-exact for the same pipeline, by time for another, and as far as the folder is whole."""
 
 import collections
 import dataclasses
@@ -49,7 +49,7 @@ from tests.support.recorded_run import (
 from tests.support.rigs import guarded
 
 SECONDS = 2.0
-DEADLINE_S = 60.0  # for what should come at once
+DEADLINE_S = 60.0  # for a thread or process that should answer at once
 
 
 def assert_same(then, now, where="step"):
@@ -81,7 +81,7 @@ def replay(folder, change=lambda rig: rig, **options):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A recording, its steps, and nothing may change it."""
+    """A recording, which tests do not change, and its steps."""
     folder = tmp_path_factory.mktemp("recorded")
     steps = record(folder / "run", calibration_file(folder), seconds=SECONDS)
     return folder / "run", steps
@@ -89,7 +89,7 @@ def recorded(tmp_path_factory):
 
 @pytest.fixture
 def copy(recorded, tmp_path):
-    """A copy that may be broken."""
+    """A copy that a test may change."""
     return shutil.copytree(recorded[0], tmp_path / "copy")
 
 
@@ -97,7 +97,7 @@ def lines(folder):
     return (folder / "log.jsonl").read_bytes().splitlines(keepends=True)
 
 
-def test_the_same_pipeline_sees_and_commands_the_same_to_the_last_bit(recorded):
+def test_the_same_pipeline_replays_to_the_last_bit(recorded):
     folder, steps = recorded
     recording = open_recording(folder)
     assert (recording.target, recording.ending, recording.truncated, recording.notes) == ("bird", "complete", False, ())
@@ -114,8 +114,8 @@ def test_the_same_pipeline_sees_and_commands_the_same_to_the_last_bit(recorded):
     assert len(limited) == len(steps)
 
 
-def test_a_rig_in_real_time_is_replayed_as_such(tmp_path):
-    """Its watchdog, a thread of its own, looks at the clock all the time and changes nothing."""
+def test_a_rig_in_real_time_replays_to_the_last_bit(tmp_path):
+    """Its watchdog's thread reads the clock all the time and changes nothing."""
     path = calibration_file(tmp_path)
     steps = record(tmp_path / "run", path, ToyDevices(real_time=True), seconds=0.5)
     again, differences = replay(tmp_path / "run")
@@ -123,15 +123,14 @@ def test_a_rig_in_real_time_is_replayed_as_such(tmp_path):
     assert differences.same
 
 
-def curious(rig):
-    """A rig whose pipeline looks at the clock twice where it did once."""
+def reading_the_clock_twice(rig):
     clock = SimpleNamespace(now=lambda: rig.clock.now() and rig.clock.now(), sleep_until=rig.clock.sleep_until)
     return dataclasses.replace(rig, clock=clock)
 
 
-def test_more_looks_at_the_clock_move_the_time_by_no_more_than_they_take(recorded):
+def test_additional_readings_of_the_clock_shift_the_time_only_until_the_next_call(recorded):
     """The bird flies 0.7 px a frame at 100 px focal length, 10 degrees/s; a few ticks of 0.1 ms are 0.005 degrees."""
-    again, _ = replay(recorded[0], curious)
+    again, _ = replay(recorded[0], reading_the_clock_twice)
     aims = [(then.aim, now.aim) for then, now in zip(recorded[1], again, strict=True)]
     assert [then is None for then, _ in aims] == [now is None for _, now in aims]
     apart = [math.hypot(then.pan - now.pan, then.tilt - now.tilt) for then, now in aims if then is not None]
@@ -142,7 +141,7 @@ def test_more_looks_at_the_clock_move_the_time_by_no_more_than_they_take(recorde
 
 
 def shifted(rig, pan=0.0, focal_px=0.0, every=1):
-    """A rig whose pipeline wants something else of the head and the lens than before."""
+    """A rig that gets other commands for head and lens, or only each n-th move."""
     zoom, head, count = Proxy(rig.zoom), Proxy(rig.head), itertools.count(1)
     zoom.zoom = lambda wanted: rig.zoom.zoom(wanted + focal_px)
     head.move = lambda p, t, speed=None: (p, t) if next(count) % every else rig.head.move(p + pan, t, speed)
@@ -168,7 +167,7 @@ def differences_of(folder, **change):
 
 
 def test_commands_that_differ_are_counted_and_measured(recorded):
-    """What is not rounded yet is compared: 0.01 rad are 0.573 degrees."""
+    """Commands are compared before they are rounded to steps: 0.01 rad are 0.573 degrees."""
     same = differences_of(recorded[0])
     assert same.same
     turned = differences_of(recorded[0], pan=0.01)
@@ -198,9 +197,9 @@ def test_differences_in_words():
 
 
 @pytest.fixture(scope="module")
-def of_track_2(tmp_path_factory):
-    """A recording of a run that follows nobody but the second track, which comes late, as the command runs it."""
-    folder = tmp_path_factory.mktemp("of_track_2")
+def recording_of_track_2(tmp_path_factory):
+    """A recording of a run that follows the second track alone, which appears late."""
+    folder = tmp_path_factory.mktemp("track_2")
     path = calibration_file(folder)
     selector = Chosen(number=2)
     with Recorder(folder / "run", CONFIG, path, "bird", selector) as recorder:
@@ -210,10 +209,10 @@ def of_track_2(tmp_path_factory):
 
 
 @pytest.fixture
-def replayed(of_track_2, tmp_path, monkeypatch, capsys):
-    """Runs the command on a copy of it: status, result and what it says."""
+def replayed(recording_of_track_2, tmp_path, monkeypatch, capsys):
+    """Function that runs `cotarget replay` on a copy: exit status, JSON and stderr."""
     monkeypatch.setattr("cotarget.detection.make_detector", lambda *_: Bright())
-    folder = shutil.copytree(of_track_2, tmp_path / "copy")
+    folder = shutil.copytree(recording_of_track_2, tmp_path / "copy")
 
     def command(*options):
         status = main(["replay", str(folder), *options])
@@ -224,14 +223,14 @@ def replayed(of_track_2, tmp_path, monkeypatch, capsys):
     return command
 
 
-def test_the_command_follows_whom_the_recorded_run_followed(replayed):
+def test_the_command_selects_the_target_as_the_recorded_run_did(replayed):
     status, result, said = replayed("--check")
     assert (status, result["differences"]["frames_differing"]) == (0, 0)
     assert "differ" not in said
     assert result["differences"]["frames"] == result["steps"] > 40
 
 
-def test_the_command_tells_of_other_commands_and_fails_where_that_is_asked_for(replayed):
+def test_the_command_reports_differences_and_fails_with_check(replayed):
     status, result, said = replayed("--policy", "first-come")
     found = result["differences"]
     assert status == 0
@@ -242,7 +241,7 @@ def test_the_command_tells_of_other_commands_and_fails_where_that_is_asked_for(r
     assert replayed("--policy", "first-come", "--check")[:2] == (1, result)
 
 
-def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(replayed):
+def test_a_recording_without_a_selector_replays_as_first_come(replayed):
     path = replayed.folder / "recording.json"
     table = json.loads(path.read_text())
     edit("whom", {})(replayed.folder)
@@ -255,7 +254,7 @@ def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(rep
     {"policy": "by-name"}, {"policy": 3}, {"click": [500.0, 3.0]}, {"click": [float("nan"), 3.0]}, {"click": [1.0]},
     {"click": [10**400, 3.0]}, {"track": 0}, {"track": 1, "policy": "first-come"}, None,
 ])  # fmt: skip
-def test_whom_nobody_can_follow_is_refused_in_one_line(replayed, table):
+def test_an_invalid_selector_is_refused(replayed, table):
     edit("whom", table)(replayed.folder)
     status, _, err = replayed()
     assert status == 1
@@ -300,7 +299,7 @@ def by_hand(copy):
     return write
 
 
-def test_what_was_not_asked_then_is_answered_by_time(by_hand):
+def test_a_call_that_was_not_recorded_is_answered_by_time(by_hand):
     played = by_hand([
         head_at(10.0, 0.0), fixed(10.0, 0), zoomed(10.02, 0), head_at(10.1, 0.1, True),
         {"call": "zoom.state", "at": 10.0, "result": [100.0, False, 10.0]},
@@ -341,7 +340,7 @@ def test_what_was_not_asked_then_is_answered_by_time(by_hand):
     (["OSError", "the cable is out"], DeviceError, "^OSError: the cable is out$"),
     (["choices", "a function of that module"], DeviceError, "^choices: a function"),
 ])  # fmt: skip
-def test_what_failed_then_fails_again(by_hand, error, kind, message):
+def test_a_recorded_error_is_raised_again(by_hand, error, kind, message):
     played = by_hand([
         {"call": "head.state", "at": 1.0, "error": error},
         {"call": "head.move", "at": 1.1, "args": [0.1, 0.2, None, False], "error": error},
@@ -363,7 +362,7 @@ class GarbledError(HaltedError):
     """An error of a driver of its own."""
 
 
-def test_an_error_that_no_version_knows_is_replayed_as_the_nearest_known_one(tmp_path):
+def test_an_error_of_another_module_is_replayed_as_its_nearest_base_class(tmp_path):
     path, failing = calibration_file(tmp_path), {("head.move", 1): GarbledError("it was halted on its way")}
     with Recorder(tmp_path / "run", CONFIG, path, "bird") as recorder, recorder.wrap(toy_rig(failing)) as rig:
         rig.fixed.read()
@@ -377,8 +376,7 @@ def test_an_error_that_no_version_knows_is_replayed_as_the_nearest_known_one(tmp
         rig.head.move(0.1, 0.2, wait=True)
 
 
-def test_a_replay_answers_with_what_was_recorded_of_the_rig(tmp_path):
-    """And not with what its configuration says, nor with defaults."""
+def test_a_replayed_rig_has_the_recorded_spec(tmp_path):
     path, rig = calibration_file(tmp_path), toy_rig(real_time=True)
     other = dataclasses.replace(rig.spec.head, delay_s=0.3)
     rig = dataclasses.replace(rig, spec=dataclasses.replace(rig.spec, head=other))
@@ -392,7 +390,7 @@ def test_a_replay_answers_with_what_was_recorded_of_the_rig(tmp_path):
         assert played.spec == spec
 
 
-def test_what_an_older_recording_lacks_of_the_rig_is_that_of_its_configuration(copy):
+def test_rates_and_delays_that_an_older_recording_lacks_are_those_of_its_configuration(copy):
     log = copy / "log.jsonl"
     first, rest = log.read_bytes().split(b"\n", 1)
     old = ("fixed_size", "zoom_size", "still_size", "focal_range_px", "pan", "tilt", "speed", "acceleration", "step")
@@ -407,7 +405,7 @@ def test_what_an_older_recording_lacks_of_the_rig_is_that_of_its_configuration(c
 
 def collect(steps, into):
     for step in steps:
-        into.append(step)  # those before a failure stay
+        into.append(step)  # steps before a failure stay
 
 
 @pytest.mark.parametrize("failing", [
@@ -416,7 +414,7 @@ def collect(steps, into):
     {("zoom.read", 9): OSError("input/output error")},
     {("head.move", 8): KeyboardInterrupt()},
 ])  # fmt: skip
-def test_an_accident_happens_again(tmp_path, failing):
+def test_the_error_that_ended_a_run_ends_its_replay(tmp_path, failing):
     path = calibration_file(tmp_path)
     error = next(iter(failing.values()))
     steps = []
@@ -434,7 +432,7 @@ def test_an_accident_happens_again(tmp_path, failing):
     assert played.differences.same
 
 
-def test_a_watchdogs_halt_is_noted_and_leaves_the_replay_alone(tmp_path):
+def test_a_halt_by_another_thread_is_logged_and_does_not_change_the_replay(tmp_path):
     path = calibration_file(tmp_path)
     steps = []
     with Recorder(tmp_path / "run", CONFIG, path, "bird") as recorder:
@@ -459,7 +457,7 @@ def asked_aside(rig):
     return answers
 
 
-def test_what_another_thread_asks_takes_nothing_from_the_run(by_hand):
+def test_calls_of_another_thread_are_answered_by_time(by_hand):
     played = by_hand([head_at(10.0, 0.0), fixed(10.0), head_at(10.1, 0.1), {"call": "head.halt", "at": 10.1}])
     rig = played.rig
     rig.fixed.read()
@@ -472,8 +470,8 @@ def cut(folder, kept):
     return open_recording(folder)
 
 
-def test_a_log_that_is_cut_anywhere_replays_what_is_whole(recorded, copy):
-    """Cut within each line of a step and at each of their ends: there are all steps but the last one or two."""
+def test_a_log_that_is_cut_anywhere_replays_its_complete_steps(recorded, copy):
+    """Cut within each line of a step and at the ends of the lines: all steps but the last one or two are left."""
     whole, (_, steps) = lines(copy), recorded
     frames = [i for i, line in enumerate(whole) if b"fixed.read" in line]
     for end in range(frames[20], frames[21] + 1):
@@ -510,7 +508,7 @@ def shorten_image(folder):
     (remove_image, r"fixed/000020.png is missing", 19),
     (shorten_image, r"fixed/000020.png is damaged", 19),
 ])  # fmt: skip
-def test_a_recording_with_a_hole_replays_up_to_it(recorded, copy, damage, said, left):
+def test_a_damaged_recording_replays_up_to_the_damage(recorded, copy, damage, said, left):
     damage(copy)
     recording = open_recording(copy)
     assert recording.truncated
@@ -520,7 +518,7 @@ def test_a_recording_with_a_hole_replays_up_to_it(recorded, copy, damage, said, 
     assert_same(recorded[1][:left], replay(copy)[0])
 
 
-def test_an_image_of_the_right_size_that_is_none_ends_the_replay_in_one_line(copy):
+def test_a_file_of_the_right_size_that_is_no_image_ends_the_replay(copy):
     path = copy / "fixed" / "000020.png"
     path.write_bytes(bytes(path.stat().st_size))
     with pytest.raises(DeviceError, match=r"000020\.png: is damaged") as caught:
@@ -528,8 +526,8 @@ def test_an_image_of_the_right_size_that_is_none_ends_the_replay_in_one_line(cop
     assert "\n" not in str(caught.value)
 
 
-def test_a_zoom_image_that_is_missing_is_stood_in_for(recorded, copy):
-    """From it nothing is decided, so the run is the same all the same."""
+def test_a_missing_zoom_image_is_replaced_by_the_one_before(recorded, copy):
+    """No decision follows from it, so the commands are the same."""
     (copy / "zoom" / "000003.png").unlink()
     (copy / "zoom" / "000000.png").unlink()
     recording = open_recording(copy)
@@ -558,8 +556,8 @@ def put(name, data):
     return lambda folder: (folder / name).write_bytes(data)
 
 
-def test_a_simulated_world_that_would_be_refused_by_now_can_still_be_replayed(copy):
-    """As an earlier version wrote it; nothing of it is simulated again."""
+def test_a_recording_of_a_world_that_is_refused_today_can_be_replayed(copy):
+    """As an earlier version wrote it; a replay simulates nothing."""
     config = json.loads((copy / "recording.json").read_text())["config"]
     for camera in ("fixed", "zoom"):  # of which the principal point was not moved with the size, at that time
         config["sim"][camera] |= {"size": [320, 240], "center_px": [326.0, 239.0], "exposure_s": 1.0}
@@ -595,7 +593,7 @@ def test_a_simulated_world_that_would_be_refused_by_now_can_still_be_replayed(co
     (put("log.jsonl", b"\x00" * 100), "copy: "),
     (lambda folder: write_log(folder, [fixed(1.0)], end=None), "copy: "),
 ])  # fmt: skip
-def test_what_is_no_recording_is_refused_in_one_line(copy, spoil, named):
+def test_a_folder_that_is_no_recording_is_refused(copy, spoil, named):
     spoil(copy)
     with pytest.raises(ConfigError) as caught:
         open_recording(copy)
@@ -608,12 +606,12 @@ def test_a_file_is_no_recording(copy):
         open_recording(copy / "log.jsonl")
 
 
-def test_another_version_of_the_program_is_told(copy):
+def test_a_recording_by_another_version_has_a_note(copy):
     edit("cotarget", "0.0.7")(copy)
     assert "0.0.7" in open_recording(copy).notes[0]
 
 
-def test_no_damage_ends_in_anything_but_one_of_our_errors(copy):
+def test_random_damage_raises_nothing_but_cotarget_errors(copy):
     """Random bytes in the log and the description: refused, cut short or replayed."""
     rng = np.random.default_rng(5)
     whole = {name: (copy / name).read_bytes() for name in ("log.jsonl", "recording.json")}
@@ -644,8 +642,8 @@ def test_no_damage_ends_in_anything_but_one_of_our_errors(copy):
 KILLED_AFTER = 17  # steps
 
 
-def test_a_run_that_is_killed_replays_up_to_shortly_before(tmp_path):
-    """SIGKILL while it records: what it said it had done is there, but for what was still on its way to the disk."""
+def test_a_killed_run_replays_up_to_its_last_complete_step(tmp_path):
+    """SIGKILL while it records: every step that it printed is there, but for the last."""
     command = [sys.executable, "-m", "tests.support.recorded_run", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         late = threading.Timer(DEADLINE_S, process.kill)  # then its lines end

@@ -1,4 +1,4 @@
-"""The emergency stop: in one process, from any thread, and across processes by a file that anybody can make."""
+"""The emergency stop: in one process, from any thread, and across processes by the stop file."""
 
 import logging
 import math
@@ -27,7 +27,7 @@ def file(tmp_path):
     return tmp_path / "stop"
 
 
-def told(rig):
+def commands(rig):
     return [what for what, _ in rig.head.log]
 
 
@@ -40,14 +40,14 @@ def test_a_stopped_head_does_not_move_until_it_is_cleared(rig):
             with pytest.raises(EmergencyStopError, match="somebody is on the roof"):
                 safe.head.move(0.1, 0.0)
             safe.clock.sleep_until(safe.clock.now() + 10.0)
-        assert told(rig) == ["move", "halt"]
+        assert commands(rig) == ["move", "halt"]
         assert not safe.head.state().moving  # it can be looked at, and through
         assert safe.fixed.read().t == safe.clock.now()
         safe.head.halt()
         assert safe.clear() == "somebody is on the roof"
         assert safe.stopped is None
         safe.head.move(0.1, 0.0)
-    assert told(rig) == ["move", "halt", "halt", "move", "halt"]
+    assert commands(rig) == ["move", "halt", "halt", "move", "halt"]
 
 
 def test_a_stop_outlasts_a_halt_that_fails(rig, caplog):
@@ -58,11 +58,11 @@ def test_a_stop_outlasts_a_halt_that_fails(rig, caplog):
         assert "the cable is out" in caplog.text
         with pytest.raises(EmergencyStopError, match="smoke"):
             safe.head.move(0.1, 0.0)
-        assert told(rig) == ["move", "halt"]
+        assert commands(rig) == ["move", "halt"]
 
 
-def test_a_stop_while_a_command_is_on_its_way_halts_after_it():
-    """Another thread, or a signal's handler, stops between the command's begin and its end."""
+def test_a_stop_during_a_command_halts_again_after_it():
+    """Another thread or a signal handler stops during the device's call."""
     rig = RealDevices()
     with guarded(rig, SafetyConfig()) as safe:
         rig.head.hang = lambda: safe.stop("smoke")
@@ -75,7 +75,7 @@ def test_a_stop_while_a_command_is_on_its_way_halts_after_it():
     (DeviceError, EmergencyStopError),  # a driver's, that the move was halted
     (KeyboardInterrupt, KeyboardInterrupt),
 ])  # fmt: skip
-def test_a_command_that_a_stop_breaks_off_tells_of_the_stop_but_hides_no_ctrl_c(raised, seen):
+def test_a_command_that_a_stop_interrupts_raises_the_stop_but_hides_no_ctrl_c(raised, seen):
     rig = RealDevices()
     with guarded(rig, SafetyConfig()) as safe:
 
@@ -89,7 +89,7 @@ def test_a_command_that_a_stop_breaks_off_tells_of_the_stop_but_hides_no_ctrl_c(
         assert rig.head.log == ["move", "halt", "halt"]
 
 
-def test_the_file_stops_every_command_and_ends_by_its_removal(rig, file):
+def test_the_file_stops_every_command_until_it_is_removed(rig, file):
     with guarded(rig, SafetyConfig(stop_file=file)) as safe:
         safe.head.move(FAR, 0.0)
         write_stop_file(file, "somebody is on the roof")
@@ -102,18 +102,18 @@ def test_the_file_stops_every_command_and_ends_by_its_removal(rig, file):
         assert "\n" not in str(caught.value)
         with pytest.raises(EmergencyStopError):
             safe.clear()
-        assert told(rig) == ["move", "halt"]
+        assert commands(rig) == ["move", "halt"]
         assert clear_stop_file(file) == "somebody is on the roof"
         safe.head.move(0.1, 0.0)
-    assert told(rig) == ["move", "halt", "move", "halt"]
+    assert commands(rig) == ["move", "halt", "move", "halt"]
 
 
-def test_looking_at_the_rig_in_simulated_time_sees_the_file(rig, file):
+def test_reading_a_frame_in_simulated_time_reads_the_file(rig, file):
     with guarded(rig, SafetyConfig(stop_file=file)) as safe:
         safe.head.move(FAR, 0.0)
         file.touch()
         safe.fixed.read()
-        assert told(rig) == ["move", "halt"]
+        assert commands(rig) == ["move", "halt"]
 
 
 def test_a_rig_is_not_opened_while_there_is_a_stop_file(rig, file):
@@ -125,7 +125,7 @@ def test_a_rig_is_not_opened_while_there_is_a_stop_file(rig, file):
 
 
 @pytest.mark.wire
-def test_the_file_halts_a_head_in_motion_whatever_the_program_does(file):
+def test_the_file_halts_a_moving_head_while_the_program_does_nothing(file):
     rig = RealDevices()
     with guarded(rig, SafetyConfig(stop_file=file, watchdog_s=1000.0)) as safe:
         safe.head.move(0.5, 0.0)
@@ -139,8 +139,8 @@ def test_the_file_halts_a_head_in_motion_whatever_the_program_does(file):
 
 
 @pytest.mark.wire
-def test_stops_from_many_threads_leave_no_command_behind_them():
-    """However commands and stops interleave, the head has been told to halt last, and nothing moves it."""
+def test_no_command_follows_a_stop_from_another_thread():
+    """However commands and stops interleave, the last call on the head is a halt."""
     for _ in range(50):
         rig = RealDevices()
         with guarded(rig, SafetyConfig()) as safe:

@@ -1,4 +1,4 @@
-"""The safety layer in front of a head that notes what it is told, and of a camera that may be late."""
+"""The safety layer in front of a head that logs its commands, and of cameras whose frames may be old."""
 
 import itertools
 import math
@@ -22,7 +22,7 @@ LIMITS = PanTiltLimits(
 
 
 class Head:
-    """Does what it is told, rounded to steps and without any limit, so that only the layer keeps it inside."""
+    """A head without limits that rounds to steps, so that only the safety layer keeps it inside."""
 
     def __init__(self, limits=LIMITS):
         self.limits, self.log, self.pose = limits, [], (0.0, 0.0)
@@ -41,7 +41,7 @@ class Head:
 
 
 class Devices:
-    """The rest: a camera whose newest frame is as old as wanted."""
+    """Devices whose fixed camera gives a frame of a certain age."""
 
     def __init__(self, head=None, age=0.06):
         self.head = head or Head()
@@ -95,7 +95,7 @@ def test_no_command_leaves_the_limits_or_exceeds_the_cap(step, soft):
     assert safe.limits.speed == pytest.approx(cap)
 
 
-# Every pair of these as angles [rad], with each of the speeds: what arithmetic can make of a command, and edges.
+# Every pair of these as angles [rad], with each of the speeds: all directions, edges, and results of arithmetic.
 AWKWARD = [
     *(math.radians(d) for d in range(-200, 201, 8)),
     *(e + d for limits in (LIMITS.pan, LIMITS.tilt) for e in limits for d in (-STEP, -1e-9, 0.0, 1e-9, STEP)),
@@ -126,7 +126,7 @@ def test_every_command_is_done_within_the_limits_or_refused(step):
 
 
 @pytest.mark.parametrize("said", [(1.9, 0.0), (0.0, -1.5), (math.nan, 0.0)])
-def test_a_head_that_says_it_goes_beyond_the_limits_is_halted(said):
+def test_a_head_that_reports_a_goal_beyond_the_limits_is_halted(said):
     rig = Devices()
     rig.head.move = lambda *a: said
     with pytest.raises(DeviceError, match=r"pan 28\.648"):
@@ -134,16 +134,18 @@ def test_a_head_that_says_it_goes_beyond_the_limits_is_halted(said):
     assert rig.head.log == ["halt"]
 
 
-def test_a_head_of_unlimited_speed_is_not_told_infinity():
+def test_a_head_of_unlimited_speed_gets_no_speed():
     head = Head(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), math.inf, math.inf, 0.0))
-    guarded(Devices(head), SafetyConfig()).head.move(0.1, 0.1)
-    assert head.log == [(0.1, 0.1, None, False)]
+    safe = guarded(Devices(head), SafetyConfig()).head
+    safe.move(0.1, 0.1)
+    safe.move(0.2, 0.2, wait=True)
+    assert head.log == [(0.1, 0.1, None, False), (0.2, 0.2, None, True)]
 
 
-def test_waiting_is_passed_on():
-    rig = Devices()
-    guarded(rig, SafetyConfig()).head.move(0.0, 0.0, wait=True)
-    assert rig.head.log[-1][3] is True
+def test_each_axis_has_the_cap_of_its_own_speed():
+    head = Head()
+    guarded(Devices(head), SafetyConfig(speed_deg_s=30.0)).head.move(0.0, 0.0, (0.1, 9.0))
+    assert head.log[-1][2] == pytest.approx((0.1, math.radians(30.0)))
 
 
 @pytest.mark.parametrize("camera", ["fixed", "zoom"])
@@ -158,7 +160,7 @@ def test_waiting_is_passed_on():
     (4.9, 4.9, "4.900 s"),
     (4.8, 4.9, "4.800 s"),
 ])  # fmt: skip
-def test_neither_camera_gives_a_frame_that_cannot_be_acted_on(camera, t, newer_than, named):
+def test_frames_that_are_too_old_or_from_the_future_are_refused(camera, t, newer_than, named):
     rig = Devices()
     reader = SimpleNamespace(size=(2, 2), read=lambda *a: Frame(np.zeros((2, 2, 3), np.uint8), t))
     setattr(rig, camera, reader)
@@ -190,20 +192,17 @@ def test_a_still_may_be_old_when_it_arrives_but_not_older_than_its_request():
         safe.zoom.capture()
 
 
-def test_the_zoom_camera_is_otherwise_passed_on():
+def test_the_cameras_are_otherwise_unchanged():
     rig, told = Devices(), []
     rig.zoom = SimpleNamespace(
         size=(320, 240), still_size=(3264, 2448), focal_range=(300.0, 4000.0), state=lambda: "state",
         zoom=lambda f: told.append(f) or 512.0,
     )  # fmt: skip
-    safe = guarded(rig, SafetyConfig()).zoom
+    guard = guarded(rig, SafetyConfig())
+    safe = guard.zoom
     assert (safe.size, safe.still_size, safe.focal_range) == ((320, 240), (3264, 2448), (300.0, 4000.0))
     assert (safe.state(), safe.zoom(500.0), told) == ("state", 512.0, [500.0])
-
-
-def test_what_a_frame_is_asked_for_is_passed_on():
-    rig = Devices()
-    guarded(rig, SafetyConfig()).fixed.read(3.0, 0.2)
+    guard.fixed.read(3.0, 0.2)
     assert rig.asked == [(3.0, 0.2)]
 
 
@@ -239,7 +238,7 @@ def test_a_head_that_cannot_halt_does_not_keep_the_rig_open():
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
 @pytest.mark.parametrize("failing", ["halt", "close"])
-def test_what_fails_on_the_way_out_does_not_hide_why(error, failing, caplog):
+def test_a_failure_to_close_does_not_hide_the_first_error(error, failing, caplog):
     rig = Devices()
     setattr(rig.head if failing == "halt" else rig, failing, broken)
     with pytest.raises(error, match="why"), guarded(rig, SafetyConfig()):
@@ -248,14 +247,14 @@ def test_what_fails_on_the_way_out_does_not_hide_why(error, failing, caplog):
     assert "cable" in caplog.text
 
 
-def test_a_halt_that_fails_once_is_tried_again_before_the_rig_closes():
+def test_a_failed_halt_is_repeated_before_the_rig_closes():
     rig, tries = Devices(), iter([broken, lambda: rig.head.log.append("halt")])
     rig.head.halt = lambda: next(tries)()
     guarded(rig, SafetyConfig()).close()
     assert rig.head.log == ["halt", "close"]
 
 
-def test_closing_twice_is_closing_once_and_nothing_moves_afterwards():
+def test_a_closed_rig_is_not_closed_again_and_does_not_move():
     rig = Devices()
     with guarded(rig, SafetyConfig()) as safe:
         safe.close()
@@ -265,7 +264,7 @@ def test_closing_twice_is_closing_once_and_nothing_moves_afterwards():
     assert rig.head.log == ["halt", "close"]
 
 
-def test_a_guarded_rig_knows_its_soft_limits():
+def test_a_guarded_rigs_spec_has_the_soft_limits():
     spec = guarded(Devices(), SafetyConfig(pan_deg=(-90.0, 45.0), speed_deg_s=30.0)).spec
     assert spec.head.limits.pan == pytest.approx((math.radians(-90.0), math.radians(45.0)))
     assert (spec.head.limits.tilt, spec.head.limits.speed) == (LIMITS.tilt, pytest.approx(math.radians(30.0)))

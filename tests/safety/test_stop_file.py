@@ -1,4 +1,4 @@
-"""The stop file: where it is, what it says, and what cannot be read or written."""
+"""The stop file: its path, its reason, and files that cannot be read or written."""
 
 import os
 from pathlib import Path
@@ -21,12 +21,12 @@ WITHOUT = "[safety]\nstop_file = false\n"
     (HARDWARE, "roof.stop"), (HARDWARE + NAMED, "run/halt"), (HARDWARE + WITHOUT, None), ("", None),
     (NAMED, "run/halt"),
 ])  # fmt: skip
-def test_every_reader_of_a_rig_finds_the_same_file(tmp_path, text, file):
+def test_configuration_and_stop_commands_find_the_same_file(tmp_path, text, file):
     rig = tmp_path / "roof.toml"
     rig.write_text(text)
     wanted = None if file is None else tmp_path / file
     assert load_config(rig).safety.stop_file == wanted
-    for broken in ("", "[sim\n"):  # stopping works where the file is TOML no more
+    for broken in ("", "[sim\n"):  # stopping works with an invalid rig.toml
         rig.write_text(text + broken)
         if wanted is not None:
             assert find_stop_file(rig) == wanted
@@ -42,15 +42,15 @@ def test_a_link_to_a_rig_has_the_stop_file_of_the_rig(tmp_path):
     assert load_config(link).safety.stop_file == find_stop_file(link) == find_stop_file(tmp_path / "roof.toml")
 
 
-def test_a_broken_line_of_the_stop_file_is_not_taken_for_the_default(tmp_path):
-    """Else a stop would be made that no rig watches."""
+def test_an_incomplete_stop_file_line_is_refused(tmp_path):
+    """By the default path a stop would be made that no rig watches."""
     (tmp_path / "roof.toml").write_text(HARDWARE + '[safety]\nstop_file = "run/halt\n')
     with pytest.raises(ConfigError, match="TOML"):
         find_stop_file(tmp_path / "roof.toml")
 
 
 @pytest.mark.parametrize("value", ["true", "5", '["stop"]'])
-def test_what_is_no_text_is_no_stop_file(tmp_path, value):
+def test_a_stop_file_that_is_no_text_is_refused(tmp_path, value):
     rig = tmp_path / "roof.toml"
     rig.write_text(f"{HARDWARE}[safety]\nstop_file = {value}\n")
     for find in (load_config, find_stop_file):
@@ -58,8 +58,8 @@ def test_what_is_no_text_is_no_stop_file(tmp_path, value):
             find(rig)
 
 
-def test_a_folder_that_cannot_be_written_keeps_the_head_from_moving(tmp_path, monkeypatch):
-    """As on a file system that became read-only; root may write whatever a folder's mode says."""
+def test_a_rig_whose_stop_file_cannot_be_written_is_refused(tmp_path, monkeypatch):
+    """As on a file system that became read-only; root ignores a folder's mode."""
     path = tmp_path / "roof.stop"
     refuse_if_stopped(path)
     monkeypatch.setattr("cotarget.safety.stop_file.os.access", lambda folder, mode: Path(folder) != tmp_path)
@@ -90,7 +90,7 @@ def names(folder):
     ("Rauch überm Dach".encode(), "Rauch überm Dach"),
     (b"x" * 100_000, "x" * 200),
 ])  # fmt: skip
-def test_whatever_is_in_the_file_it_stops_and_gives_one_printable_line(file, content, reason):
+def test_any_content_stops_and_gives_one_printable_line(file, content, reason):
     file.write_bytes(content)
     assert stop_reason(file) == reason
     with pytest.raises(EmergencyStopError) as caught:
@@ -107,7 +107,7 @@ def test_no_file_is_no_stop(file):
     assert clear_stop_file(file.parent / "other") is None
 
 
-def test_what_cannot_be_looked_at_stops(file):
+def test_an_unreadable_stop_file_is_a_stop(file):
     file.mkdir()
     assert "Is a directory" in stop_reason(file)
     with pytest.raises(DeviceError, match=f"^{file}: "):
@@ -117,7 +117,7 @@ def test_what_cannot_be_looked_at_stops(file):
     assert stop_reason(loop) is not None
 
 
-def test_a_stop_is_written_whole_and_the_newest_holds(tmp_path):
+def test_the_newest_stop_holds_and_leaves_no_other_file(tmp_path):
     file = tmp_path / "stop"
     write_stop_file(file, "smoke")
     write_stop_file(file, "fire")
@@ -138,14 +138,14 @@ def test_a_full_disk_stops_without_a_reason(file, monkeypatch):
     assert stop_reason(file) == "no reason given"
 
 
-def test_a_stop_that_cannot_be_written_is_told(tmp_path):
+def test_a_stop_that_cannot_be_written_is_an_error(tmp_path):
     name = "x" * 300  # longer than file systems take
     with pytest.raises(DeviceError, match="NOT stopped"):
         write_stop_file(tmp_path / name, "smoke")
 
 
 @pytest.mark.parametrize("folder", ["mistyped", "mistyped/twice", "a file"])
-def test_a_stop_file_whose_folder_is_not_there_is_told_and_no_folder_made(tmp_path, folder):
+def test_a_stop_file_without_its_folder_is_refused_and_no_folder_is_made(tmp_path, folder):
     (tmp_path / "a file").touch()
     file = tmp_path / folder / "stop"
     with pytest.raises(DeviceError, match=rf"{folder}.*NOT stopped"):

@@ -1,4 +1,4 @@
-"""The watchdog: in simulated time to the instant, and in real time by its thread, which a hung program cannot stop."""
+"""The watchdog: exact in simulated time, and in real time by its thread, which a hung program cannot stop."""
 
 import logging
 import math
@@ -21,7 +21,6 @@ FAR = math.radians(100)
 EXACT = 1e-9  # rounding of times and angles
 SHORT_S = 0.1  # a watchdog for tests in real time
 TIMELY_S = 1.0  # beyond the watchdog's time, for a thread of a busy machine to wake up; it takes 1 ms on an idle one
-
 NOT_HALTED = "the head could not be halted, and may go on to the goal of its last command"
 
 
@@ -50,7 +49,7 @@ def warnings(caplog):
     return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
 
 
-def test_a_head_left_alone_is_halted_when_the_watchdogs_time_is_over(rig, safe, caplog):
+def test_a_head_without_a_sign_of_life_is_halted_after_the_watchdogs_time(rig, safe, caplog):
     safe.head.move(FAR, 0.0)
     safe.clock.sleep_until(10.0)
     assert rig.head.halts == [pytest.approx(WATCHDOG_S, abs=EXACT)]
@@ -62,7 +61,7 @@ def test_a_head_left_alone_is_halted_when_the_watchdogs_time_is_over(rig, safe, 
     assert warnings(caplog) == ["halting the head: neither a fresh frame nor a command for 0.35 s"]
 
 
-def test_the_next_command_is_obeyed_and_watched_again(rig, safe, caplog):
+def test_a_command_after_a_halt_is_obeyed_and_watched(rig, safe, caplog):
     for start in (0.0, 5.0):
         safe.clock.sleep_until(start)
         safe.head.move(FAR, 0.0)
@@ -72,7 +71,7 @@ def test_the_next_command_is_obeyed_and_watched_again(rig, safe, caplog):
 
 
 @pytest.mark.parametrize("camera", ["fixed", "zoom"])
-def test_fresh_frames_of_either_camera_let_it_go_on(rig, safe, camera):
+def test_fresh_frames_of_either_camera_are_signs_of_life(rig, safe, camera):
     safe.head.move(FAR, 0.0)
     t = None
     while safe.clock.now() < 3.0:
@@ -82,14 +81,14 @@ def test_fresh_frames_of_either_camera_let_it_go_on(rig, safe, camera):
     assert not rig.head.halts
 
 
-def test_stills_are_frames_too(rig, safe):
+def test_stills_are_signs_of_life(rig, safe):
     safe.head.move(FAR, 0.0)
     while safe.clock.now() < 3.0:
         safe.zoom.capture()
     assert not rig.head.halts
 
 
-def test_commands_let_it_go_on(rig, safe):
+def test_commands_are_signs_of_life(rig, safe):
     for k in range(10):
         safe.clock.sleep_until(0.3 * k)
         safe.head.move(FAR, 0.0)
@@ -106,7 +105,7 @@ def test_a_frozen_frame_is_no_sign_of_life(rig, safe):
     assert WATCHDOG_S <= rig.head.halts[0] - last <= WATCHDOG_S + rig.fixed.period
 
 
-def test_looking_at_the_head_is_no_sign_of_life(rig, safe):
+def test_reading_the_heads_state_is_no_sign_of_life(rig, safe):
     safe.head.move(FAR, 0.0)
     while safe.clock.now() < 2.0:
         safe.head.state()
@@ -124,8 +123,8 @@ def test_a_dead_camera_halts_the_head_before_its_timeout(rig, safe, camera):
     assert safe.clock.now() == pytest.approx(1.0, abs=EXACT)
 
 
-def test_a_head_that_waits_for_a_person_is_left_in_peace(rig, safe, caplog):
-    """As in a capture session: the way itself takes longer than the watchdog's time, and so does the person."""
+def test_a_head_that_has_arrived_is_not_watched(rig, safe, caplog):
+    """As in a capture session, where a person then holds the board; the way itself takes longer than the watchdog."""
     safe.head.move(FAR, 0.0, wait=True)
     assert safe.clock.now() > 2 * WATCHDOG_S
     safe.clock.sleep_until(60.0)
@@ -134,7 +133,7 @@ def test_a_head_that_waits_for_a_person_is_left_in_peace(rig, safe, caplog):
     assert not warnings(caplog)
 
 
-def test_a_head_that_is_seen_to_rest_at_its_goal_is_left_in_peace(rig, safe, caplog):
+def test_a_head_that_reports_rest_at_its_goal_is_not_watched(rig, safe, caplog):
     safe.head.move(0.01, 0.0)
     safe.head.state()  # about to move: not at rest yet
     safe.clock.sleep_until(0.3)
@@ -145,8 +144,8 @@ def test_a_head_that_is_seen_to_rest_at_its_goal_is_left_in_peace(rig, safe, cap
 
 
 @pytest.mark.parametrize("goal", [(FAR, 0.0), (0.0, math.radians(20))], ids=["pan", "tilt"])
-def test_a_head_that_rests_elsewhere_is_watched_on(rig, safe, goal):
-    """It has not started yet: one axis is at its goal, the other is not."""
+def test_a_head_that_rests_off_its_goal_is_watched(rig, safe, goal):
+    """It has not started: one axis is at its goal, the other is not."""
     rig.head.state = lambda: PanTiltState(0.0, 0.0, moving=False, t=rig.clock.now())
     safe.head.move(*goal)
     safe.head.state()
@@ -154,7 +153,7 @@ def test_a_head_that_rests_elsewhere_is_watched_on(rig, safe, goal):
     assert rig.head.halts == [pytest.approx(WATCHDOG_S, abs=EXACT)]
 
 
-def test_a_head_that_passes_its_goal_is_watched_on(rig, safe):
+def test_a_head_that_passes_its_goal_is_watched(rig, safe):
     """A moving head is sent to where it is: it is at its goal, and overshoots."""
     safe.head.move(FAR, 0.0)
     safe.clock.sleep_until(0.3)
@@ -164,11 +163,26 @@ def test_a_head_that_passes_its_goal_is_watched_on(rig, safe):
     assert rig.head.halts == [pytest.approx(0.3 + WATCHDOG_S, abs=EXACT)]
 
 
-def test_time_that_passes_behind_its_back_counts(rig, safe):
+def test_time_that_passes_outside_of_calls_counts(rig, safe):
     safe.head.move(FAR, 0.0)
     rig.clock.sleep_until(0.7)
     safe.head.state()
     assert rig.head.halts == [0.7]
+
+
+def test_a_frame_that_arrives_while_the_watchdog_reads_the_clock_is_a_sign_of_life():
+    """As for a thread of a busy machine that is suspended there."""
+    head, clock = RealDevices().head, SimpleNamespace(now=lambda: 0.0)
+    watched = watchdog.Watchdog(head, clock, SafetyConfig(), threaded=False)
+    watched.begin((1.0, 0.0))
+
+    def now():
+        watched.alive(2 * WATCHDOG_S)
+        return 2 * WATCHDOG_S
+
+    clock.now = now
+    watched.watch()
+    assert head.log == []
 
 
 def test_a_clock_that_runs_backwards_halts_the_head(caplog):
@@ -188,7 +202,7 @@ def test_a_clock_that_runs_backwards_halts_the_head(caplog):
         now[0] = 41.0
 
 
-def test_a_halt_that_fails_is_told_and_tried_again_before_anything_else(rig, safe, caplog):
+def test_a_failed_halt_is_logged_and_repeated_before_the_next_command(rig, safe, caplog):
     safe.head.move(FAR, 0.0)
     rig.head.broken = 3
     safe.clock.sleep_until(1.0)  # the first try
@@ -206,7 +220,7 @@ def test_a_halt_that_fails_is_told_and_tried_again_before_anything_else(rig, saf
     assert warnings(caplog)[-1] == "the head is halted now"
 
 
-def test_a_halt_of_the_program_that_fails_is_tried_again(rig, safe):
+def test_a_failed_halt_of_the_program_is_repeated(rig, safe):
     safe.head.move(FAR, 0.0)
     rig.head.broken = 1
     with pytest.raises(OSError, match="cable"):
@@ -217,8 +231,8 @@ def test_a_halt_of_the_program_that_fails_is_tried_again(rig, safe):
 
 @pytest.mark.wire
 @pytest.mark.parametrize("where", ["reading", "commanding", "computing"])
-def test_a_program_that_hangs_ends_in_a_halted_head(where, caplog):
-    """With the default watchdog; what hangs goes on hanging until the head is halted."""
+def test_the_head_of_a_hung_program_is_halted(where, caplog):
+    """With the default watchdog; the program hangs until the head is halted."""
     rig = RealDevices()
     halted_at = []
     halt = rig.head.halt
@@ -240,7 +254,7 @@ def test_a_program_that_hangs_ends_in_a_halted_head(where, caplog):
 
 
 @pytest.mark.wire
-def test_a_command_that_was_stuck_when_the_head_was_halted_is_not_left_to_run(real):
+def test_a_command_that_hung_during_a_halt_is_halted_when_it_returns(real):
     rig, safe = real
     rig.head.hang = rig.head.wait_for_halt
     safe.head.move(1.0, 0.0)
@@ -251,7 +265,7 @@ def test_a_command_that_was_stuck_when_the_head_was_halted_is_not_left_to_run(re
 
 
 @pytest.mark.wire
-def test_somebody_who_looks_at_the_head_does_not_end_the_watch_over_a_command_on_its_way(real):
+def test_a_state_read_during_a_command_does_not_end_its_watch(real):
     """The head rests at the goal already, but the command that hangs is still to come."""
     rig, safe = real
     rig.head.hang = lambda: (safe.head.state(), rig.head.wait_for_halt())
@@ -260,7 +274,7 @@ def test_somebody_who_looks_at_the_head_does_not_end_the_watch_over_a_command_on
 
 
 @pytest.mark.wire
-def test_a_wait_is_watched_for_no_longer_than_the_way_takes():
+def test_a_wait_is_limited_by_the_duration_of_the_motion():
     """1 rad at 4 rad/s with ramps of 0.1 s takes 0.35 s: the device may wait for that, half as long again, and some."""
     rig = RealDevices()
     with guarded(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
@@ -283,7 +297,7 @@ TICK_S = 0.001  # between looks at a head that never arrives
     ((1.0, 0.5), (4.0, 1.0), False, 1.0 / 1 + 1.0 / 40),  # the slower axis counts
     ((1.0, 0.0), None, True, 1.0 / 4 + 0.1 + 2 * 0.1),  # it may move the other way: it brakes and speeds up first
 ])  # fmt: skip
-def test_a_device_may_wait_half_as_long_again_as_the_way_takes(goal, speed, moving, way_s):
+def test_a_device_may_wait_one_and_a_half_times_the_duration_of_the_motion(goal, speed, moving, way_s):
     """On a clock that the waiting device itself turns."""
     now = [0.0]
     rig = RealDevices(SimpleNamespace(now=lambda: now[0], sleep_until=lambda t: None))
@@ -302,7 +316,7 @@ def test_a_device_may_wait_half_as_long_again_as_the_way_takes(goal, speed, movi
 
 
 @pytest.mark.wire
-def test_the_thread_halts_until_the_head_obeys(real, caplog):
+def test_the_thread_repeats_the_halt_until_it_succeeds(real, caplog):
     rig, safe = real
     rig.head.failing = 3
     safe.head.move(1.0, 0.0)
@@ -312,7 +326,7 @@ def test_the_thread_halts_until_the_head_obeys(real, caplog):
     assert [record.levelname for record in caplog.records][:2] == ["WARNING", "ERROR"]
 
 
-def test_the_error_that_ends_a_run_is_not_told_again_by_the_close(caplog):
+def test_closing_does_not_log_the_error_that_ended_the_run_again(caplog):
     rig = RealDevices()
     rig.head.failing = 1000
     with pytest.raises(DeviceError, match="the cable is out"), guarded(rig, SafetyConfig()):
@@ -322,8 +336,8 @@ def test_the_error_that_ends_a_run_is_not_told_again_by_the_close(caplog):
 
 @pytest.mark.wire
 @pytest.mark.parametrize("why", [None, ValueError])
-def test_a_head_that_cannot_be_halted_is_told_of_once(caplog, why):
-    """By the log when it happens, and by whatever ends the program; not by each that tries again."""
+def test_a_head_that_cannot_be_halted_is_logged_once(caplog, why):
+    """When it happens, and when the rig is closed; not at each further try."""
     rig = RealDevices()
     rig.head.failing = 1000
     ends = pytest.raises(OSError, match="cable") if why is None else pytest.raises(why)
@@ -387,7 +401,7 @@ def hung(monkeypatch):
 
 
 @pytest.mark.wire
-def test_a_stop_file_that_cannot_be_looked_at_does_not_keep_the_watchdog_from_halting(hung, tmp_path, caplog):
+def test_a_stop_file_that_hangs_does_not_keep_the_watchdog_from_halting(hung, tmp_path, caplog):
     rig = RealDevices()
     with guarded(rig, SafetyConfig(watchdog_s=SHORT_S, stop_file=tmp_path / "stop")) as safe:
         safe.head.move(1.0, 0.0)
@@ -398,8 +412,8 @@ def test_a_stop_file_that_cannot_be_looked_at_does_not_keep_the_watchdog_from_ha
 
 
 @pytest.mark.wire
-def test_a_command_waits_for_no_look_where_a_recent_one_found_no_stop(hung, tmp_path, monkeypatch):
-    """Nobody but the test watches here, and the clock by which a look is recent goes on when the test says."""
+def test_a_command_trusts_a_recent_reading_of_the_stop_file(hung, tmp_path, monkeypatch):
+    """Only the test calls `watch` here, and moves the clock by which a reading is recent."""
     now = 5.0
     monkeypatch.setattr(stop_file, "monotonic", lambda: now)
     head = RealDevices().head
@@ -418,8 +432,8 @@ def test_a_command_waits_for_no_look_where_a_recent_one_found_no_stop(hung, tmp_
 
 
 @pytest.mark.wire
-def test_a_stop_that_was_seen_is_looked_at_again_before_the_next_command(tmp_path):
-    """What the operator has cleared keeps nobody waiting for the next look of the thread."""
+def test_a_command_after_a_stop_reads_the_file_again(tmp_path):
+    """A cleared stop delays no command until the thread reads the file."""
     watched = watchdog.Watchdog(
         RealDevices().head, RealDevices().clock, SafetyConfig(stop_file=tmp_path / "stop"), threaded=True
     )
@@ -434,7 +448,7 @@ def test_a_stop_that_was_seen_is_looked_at_again_before_the_next_command(tmp_pat
 
 
 @pytest.mark.wire
-def test_it_counts_as_a_stop_until_it_answers(hung, tmp_path):
+def test_a_stop_file_that_hangs_counts_as_a_stop_until_it_answers(hung, tmp_path):
     rig = RealDevices()
     with guarded(rig, SafetyConfig(watchdog_s=1000.0, stop_file=tmp_path / "stop")) as safe:
         safe.head.move(1.0, 0.0)
@@ -454,7 +468,7 @@ def test_it_counts_as_a_stop_until_it_answers(hung, tmp_path):
 
 
 @pytest.mark.wire
-def test_a_pipe_in_the_stop_files_place_stops(tmp_path):
+def test_a_pipe_as_stop_file_is_a_stop(tmp_path):
     rig = RealDevices()
     with guarded(rig, SafetyConfig(watchdog_s=1000.0, stop_file=tmp_path / "stop")) as safe:
         safe.head.move(1.0, 0.0)
@@ -465,12 +479,12 @@ def test_a_pipe_in_the_stop_files_place_stops(tmp_path):
 
 
 @pytest.mark.wire
-def test_fresh_frames_keep_the_thread_quiet(real):
+def test_the_thread_does_not_halt_while_frames_are_fresh(real):
     """Read as fast as they come, for several times the watchdog's time."""
     rig, safe = real
+    longest, last = 0.0, time.monotonic()
     safe.head.move(1.0, 0.0)
     end = time.monotonic() + 5 * SHORT_S
-    longest, last = 0.0, time.monotonic()
     while time.monotonic() < end:
         safe.fixed.read()
         longest, last = max(longest, time.monotonic() - last), time.monotonic()
