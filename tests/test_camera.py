@@ -43,7 +43,7 @@ def test_points_behind_or_beyond_the_fold_are_nan():
     assert np.isnan(folded.ray(np.array([5000.0, 240.0]))).all()
 
 
-def test_one_ray_is_that_of_many_and_its_slope_what_differences_say():
+def test_tangents_of_one_pixel_equal_rays_and_their_differences():
     pixels = np.random.default_rng(1).uniform((0, 0), (639, 479), (50, 2))
     for pixel, ray in zip(pixels, DISTORTED.ray(pixels), strict=True):
         tangent, slope = DISTORTED.tangents(pixel)

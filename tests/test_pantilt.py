@@ -83,7 +83,7 @@ def test_inverse_hits_random_targets_in_both_branches():
     assert found >= MADE_FROM_FOUND * RIGS * TARGETS
 
 
-def test_one_target_is_solved_as_many_are():
+def test_solve_of_one_target_equals_that_of_many():
     """Targets too near to be reached, on the pan axis and anywhere else, with a pupil that has moved."""
     rng = np.random.default_rng(3)
     for _ in range(100):
@@ -125,7 +125,7 @@ def test_nearest_minimises_the_larger_travel_of_both_axes(target, pan_limits, ti
     assert np.abs((found.pan, found.tilt)) == pytest.approx(np.abs(expected), abs=ROUNDING)
 
 
-def test_beyond_the_limits_is_said_with_the_angles():
+def test_target_beyond_the_limits_is_refused_with_its_angles():
     with pytest.raises(UnreachableError, match=r"needs pan 90\.00, tilt 0\.00.*limits pan -45 to 45, tilt -30 to 30"):
         nearest(solve(np.array([5.0, 0, 0]), RigidTransform.identity()), np.radians((-45, 45)), np.radians((-30, 30)))
 

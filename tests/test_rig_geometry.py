@@ -59,7 +59,7 @@ def test_without_a_calibrated_head_there_is_no_pose_in_the_base():
             wanted()
 
 
-def test_both_follow_the_size_of_their_streams():
+def test_cameras_follow_the_size_of_their_streams():
     fixed, head = FixedCamera(LENS), head_of()
     with pytest.raises(ConfigError, match="another aspect ratio"):
         fixed.resized((640, 240))

@@ -393,7 +393,7 @@ OWN_KEYS = {"fixed", "zoom", "T_zoom0_fixed"}  # a calibration of any version ha
 WANTED = "give a calibration.json, as cotarget calibrate writes it"
 OTHERS = (
     ({"captures", "board"}, "the index of captures: cotarget calibrate --from its folder makes one of them"),
-    ({"versions", "config"}, "what a capture session or a recording says of itself"),
+    ({"versions", "config"}, "the description of a capture session or a recording"),
 )
 
 

@@ -5,7 +5,7 @@
 2. One fit of both cameras, Gamma, T and the head's geometry to all views at the shortest focal length.
 3. The zoom samples one after the other, each predicted from the one before; then one fit of everything.
 4. Views for which the head stood elsewhere than it reported, and single wrong corners, are left out. The head's jitter
-   is estimated, and the fixed camera's k3 where the corners ask for it.
+   is estimated, and the fixed camera's k3 where it is significant.
 5. Covariance: parameters held in the fit (k3, encoder scales) are considered; captures kept out of the fit widen it
    where they are missed by more than predicted.
 
@@ -81,7 +81,7 @@ from cotarget.rig import Image
 
 # The head's jitter
 
-# Range of the search [rad], and twice the log-likelihood ratio from which jitter is believed: chance exceeds it once in
+# Range of the search [rad], and twice the log-likelihood ratio from which jitter is accepted: chance exceeds it once in
 # twenty times (a half chi-square at its border).
 JITTER_RANGE = (1e-7, 0.1)
 JITTER_EVIDENCE = 2.71
@@ -286,8 +286,8 @@ WRONG_SIGMAS, WRONG_FLOOR_PX = 6.0, 0.5
 WRONG_SHARE = 0.3  # a view with a larger share of wrong corners is left out as a whole
 NO_PLACE = "its board is seen by neither camera at the shortest focal length, so that its pose is unknown"
 # A view is left out when the head stands this many times farther from the reported angles than usual, and by more than
-# the floor, which allows for the backlash and sag of usual heads.
-ELSEWHERE_SIGMAS, ELSEWHERE_FLOOR = 6.0, np.radians(0.05)
+# the floor [rad], which allows for the backlash and sag of usual heads.
+WRONG_HEAD_SIGMAS, WRONG_HEAD_FLOOR = 6.0, np.radians(0.05)
 JITTER_ROUNDS, SETTLED = 5, 0.03  # rounds of jitter and parameters in turn; relative change at which they end
 LARGEST_JITTER = np.radians(1.5)
 FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # fewest views and placements of a zoom sample
@@ -296,8 +296,8 @@ WARP_SHARE = 0.004
 # k3 of the fixed camera is freed where it is this many standard deviations from 0, which chance does for one lens in
 # sixteen thousand; below that it is considered (`with_consider_covariance`). K3_WIDE is its prior's sigma until then.
 K3_SIGMAS, K3_WIDE = 4.0, 1.0
-# A lens that asks for k3 does not follow this model, and departs from it more where no board was seen. This factor on
-# the standard deviations covers rational and fisheye lenses whose nearest fit is 0.2 px off
+# A lens that needs k3 does not follow this model, and departs from it more where no board was seen. This factor on the
+# standard deviations covers rational and fisheye lenses whose nearest fit is 0.2 px off
 # (experiments.calibration.mismatch).
 K3_WIDENED = 1.4
 # Blocks that are held unless they are freed, and considered in the covariance.
@@ -443,37 +443,32 @@ def _cleaned(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Re
 
     Returns the fit of the rest, the number of single corners left out, and the views left out.
     """
-    found, elsewhere = _without_heads_elsewhere(found, points, prior)
-    found, wrong, spoilt = _without_wrong_corners(found, points, prior)
-    return found, wrong, [*elsewhere, *spoilt]
+    found, by_head = _without_wrong_heads(found, points, prior)
+    found, wrong, by_corners = _without_wrong_corners(found, points, prior)
+    return found, wrong, [*by_head, *by_corners]
 
 
-def _without_heads_elsewhere(found: Fit, points: Array, prior: Prior) -> tuple[Fit, list[Rejected]]:
+def _without_wrong_heads(found: Fit, points: Array, prior: Prior) -> tuple[Fit, list[Rejected]]:
     """Leave out views for which the head stood much farther from the reported angles than for others."""
     if "hand" not in found.free:
         return found, []
     off = np.linalg.norm(head_turns(found, points), axis=-1)
-    turned = np.isfinite(off)
-    limit = max(ELSEWHERE_SIGMAS * float(np.median(off[turned])) * MEDIAN_TO_SIGMA, ELSEWHERE_FLOOR)
-    elsewhere = turned & (np.where(turned, off, 0.0) > limit)
-    if not elsewhere.any():
-        return found, []
-    rejected = [
-        Rejected(view.name, f"the head stood {np.degrees(angle):.2f} degrees from where it says")
-        for view, angle, out in zip(found.views, off, elsewhere, strict=True)
-        if out
-    ]
-    kept = [view for view, out in zip(found.views, elsewhere, strict=True) if not out]
-    return fit(found.model, kept, points, found.free, prior=prior), rejected
+    limit = max(WRONG_HEAD_SIGMAS * float(np.nanmedian(off)) * MEDIAN_TO_SIGMA, WRONG_HEAD_FLOOR)
+    kept, rejected = [], []
+    for view, angle in zip(found.views, off, strict=True):
+        if angle > limit:
+            rejected.append(Rejected(view.name, f"the head stood {np.degrees(angle):.2f} degrees off its report"))
+        else:
+            kept.append(view)
+    return (fit(found.model, kept, points, found.free, prior=prior) if rejected else found), rejected
 
 
 def _without_wrong_corners(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:
     """Leave out corners with far too large residuals, and estimate the head's jitter; returns as `_cleaned`."""
     found = _with_jitter(found, points, prior)
-    lengths = np.linalg.norm(found.left, axis=-1)
-    seen = np.isfinite(lengths)
-    limit = max(WRONG_SIGMAS * robust_sigma(found.left[seen]), WRONG_FLOOR_PX)
-    wrong = seen & (np.where(seen, lengths, 0.0) > limit)
+    lengths = np.linalg.norm(found.left, axis=-1)  # nan for corners that are not seen
+    limit = max(WRONG_SIGMAS * robust_sigma(found.left[np.isfinite(lengths)]), WRONG_FLOOR_PX)
+    wrong = lengths > limit
     if not wrong.any():
         return found, 0, []
     views, rejected, count = [], [], 0

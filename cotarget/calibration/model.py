@@ -119,7 +119,7 @@ class Covariance:
     """Covariance of a calibration's parameters; parameters held in the fit are left out.
 
         fixed.fx .fy .cx .cy                 [px], of the image size calibrated
-        fixed.k1 .k2 .p1 .p2                 without unit; and .k3, where the corners ask for it
+        fixed.k1 .k2 .p1 .p2                 without unit; and .k3, where it is significant
         zoom[i].fx ... zoom[i].p2            the same for zoom sample i, counted from 0
         zoom[i].pupil                        [m], for all zoom samples but the first
         T_zoom0_fixed.rx .ry .rz .tx .ty .tz     [rad] and [m]

@@ -42,7 +42,9 @@ WORDS = {
     "squareness": ("squareness", NEARER),
     "tilt_scale": ("scale of tilt", "add tilt"),
     "pan_scale": ("scale of pan", "add pan"),
-    **dict.fromkeys(("pan_zero", "tilt_zero"), ("zero angles", "hold these or T_zoom0_fixed: they say the same")),
+    **dict.fromkeys(
+        ("pan_zero", "tilt_zero"), ("zero angles", "hold these or T_zoom0_fixed: they have the same effect")
+    ),
 }
 # Noise of the hand's pose perturbs the axes and makes an undetermined direction look measured. A direction must be seen
 # this many times as strongly as by noise alone; below, noise biases the estimate by more than a tenth.

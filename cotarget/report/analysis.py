@@ -375,7 +375,7 @@ def gather(calibration: Calibration) -> Evidence | None:
         model = place_boards(model_of(calibration), views, points)
         found = fit(model, views, points, (), jitter=calibration.jitter)
     except np.linalg.LinAlgError:
-        raise CalibrationError("the stored corners do not tell where their boards were") from None
+        raise CalibrationError("the stored corners do not determine the boards' poses") from None
     boards = list(found.model.boards.values())
     middles = np.array([T.apply(points.mean(axis=0)) for T in boards])
     normals = np.array([T.rotation.as_matrix()[:, 2] for T in boards])

@@ -1,6 +1,6 @@
-"""HTML page of the calibration report, self-contained, with its figures in a folder beside it as well.
+"""HTML page of the calibration report, self-contained; its figures are in a folder beside it too.
 
-The page's text and layout are `templates/calibration.html`; this module computes what it shows.
+The page's text and layout are `templates/calibration.html`.
 """
 
 import tempfile
@@ -76,7 +76,7 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
 
     Args:
         path: file of the page; report.html has its figures in report_pictures.
-        calibration: calibration by any method; the page says what it does not hold.
+        calibration: calibration by any method.
         source: name of the calibration on the page.
 
     Returns:
@@ -136,7 +136,7 @@ def _write(path: Path, page: str, made: dict[str, Plot]) -> None:
 
 
 def _pointing(calibration: Calibration, found: Analysis) -> dict[str, Any] | None:
-    """Compute what the page says of the predicted error; None where nothing can be predicted."""
+    """Compute the page's figures of the predicted error; None where nothing can be predicted."""
     at = found.at
     if not at or not np.isfinite(at[-1].rms):
         return None

@@ -331,8 +331,8 @@ def _about_k3(calibration: Calibration) -> str:
     if sigma is None:
         return _held(calibration.fixed.lens)
     if not k3:
-        return f"k3 is held at 0; the corners lean to one of {digits(sigma, 1)}, a doubt that is counted everywhere."
-    return f"The corners ask for k3: it is {value_and_sigma(k3, sigma)}. Beyond the boards such a lens is less certain."
+        return f"k3 is held at 0; the corners suggest {digits(sigma, 1)}, which every uncertainty here includes."
+    return f"k3 is significant: {value_and_sigma(k3, sigma)}. Beyond the boards such a lens is less certain."
 
 
 def _numbers(lens: Intrinsics) -> dict[str, float]:

@@ -31,7 +31,7 @@ def started(rig):
     return recorder
 
 
-def test_a_board_in_hands_is_waited_for():
+def test_session_waits_until_a_held_board_is_still():
     rig = SyntheticRig()
     rig.board = SlowHands(rig)
     rig.placed.append((0.0, pose([-0.4, -0.25, 3.0], [0, 0, 0])))
@@ -41,7 +41,7 @@ def test_a_board_in_hands_is_waited_for():
     assert recorder.see_fixed() is not None
 
 
-def test_a_board_that_nobody_brings_is_not_waited_for_without_end():
+def test_session_stops_waiting_for_a_board_after_its_patience():
     rig = SyntheticRig()
     rig.board = replace(rig.board, patience=5.0)
     recorder, begun = started(rig), rig.t

@@ -17,7 +17,7 @@ PIXELS_PER_SQUARE = 0.02 / 0.0254 * 300
 CORNER_PX = 0.2  # 0.02 mm on paper: edges within a pixel are drawn in few levels, and the finder errs too
 
 
-def test_a_pdf_has_the_size_it_says(tmp_path):
+def test_pdf_of_a_board_has_its_true_size(tmp_path):
     """8 x 5 squares of 20 mm with a square of border: 200 x 140 mm, in points of 1/72 inch."""
     assert print_board(tmp_path / "board.pdf", BOARD) == pytest.approx((0.2, 0.14))
     box = re.search(rb"/MediaBox \[ *([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+)", (tmp_path / "board.pdf").read_bytes())
@@ -26,7 +26,7 @@ def test_a_pdf_has_the_size_it_says(tmp_path):
 
 
 @pytest.mark.parametrize("board", [BOARD, BoardConfig("charuco", (6, 4), 0.02)], ids=lambda board: board.kind)
-def test_a_png_is_read_as_the_board_it_is(tmp_path, board):
+def test_png_of_a_board_is_found_at_its_true_size(tmp_path, board):
     print_board(tmp_path / "board.png", board)
     corners = find_corners(cv2.imread(str(tmp_path / "board.png")), board)
     expected = board_points(board)[:, :2] / board.square * PIXELS_PER_SQUARE
@@ -41,7 +41,7 @@ def test_a_png_is_read_as_the_board_it_is(tmp_path, board):
     ("board.pdf", BoardConfig(corners=(6, 6)), "board.corners"),
     ("board.pdf", BoardConfig(corners=(9, 6), square=25.0), "metres"),
 ])  # fmt: skip
-def test_what_cannot_be_printed_is_said(tmp_path, name, board, said):
+def test_print_board_refuses_unknown_formats_and_impossible_boards(tmp_path, name, board, said):
     with pytest.raises(ConfigError, match=re.escape(said)):
         print_board(tmp_path / name, board)
     assert not list(tmp_path.iterdir())
@@ -49,7 +49,7 @@ def test_what_cannot_be_printed_is_said(tmp_path, name, board, said):
 
 @pytest.mark.parametrize("suffix", [".pdf", ".svg", ".png"])
 @pytest.mark.parametrize("room", [0, 4096])
-def test_a_full_disk_leaves_nothing(tmp_path, suffix, room):
+def test_full_disk_leaves_no_partial_file(tmp_path, suffix, room):
     path = tmp_path / f"board{suffix}"
     with full_disk(room), pytest.raises(ConfigError, match=re.escape(f"{path}: cannot be written: {SAID}")):
         print_board(path, BoardConfig(corners=(9, 6), square=0.025))

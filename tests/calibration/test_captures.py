@@ -34,7 +34,7 @@ def write(folder, rows, **changes):
     (folder / INDEX).write_text(json.dumps(table))
 
 
-def test_order_and_unlisted_images_do_no_harm(folder):
+def test_captures_may_be_in_any_order_beside_unlisted_images(folder):
     write(folder, [FIXED | {"pan": None, "tilt": None}, ZOOM], board=BOARD | {"kind": "charuco"})
     index = read_index(folder)
     assert index.board.kind == "charuco"
@@ -61,7 +61,7 @@ def test_order_and_unlisted_images_do_no_harm(folder):
     ([FIXED | {"file": "text.png"}, ZOOM], {}, "text.png"),
     ([FIXED, FIXED | {"file": "small.png"}, ZOOM], {}, "small.png: is 32x24 px"),
 ])  # fmt: skip
-def test_what_makes_no_sense_is_refused_by_name(folder, rows, changes, said):
+def test_malformed_index_is_refused_with_its_key(folder, rows, changes, said):
     write(folder, rows, **changes)
     with pytest.raises(CalibrationError) as caught:
         calibrate_captures(folder)
@@ -70,7 +70,7 @@ def test_what_makes_no_sense_is_refused_by_name(folder, rows, changes, said):
     assert "\n" not in str(caught.value)
 
 
-def test_what_a_killed_run_left_is_no_photo(tmp_path):
+def test_photos_leave_out_hidden_files(tmp_path):
     images(tmp_path, dict.fromkeys(("left1.png", "right1.png", ".left7.part.png", ".right1.part.png"), SMALL))
     captures, unpaired = pair_photos(tmp_path, "*left*.png", "*right*.png")
     assert [capture.source for capture in captures] == ["left1.png", "right1.png"]
@@ -86,7 +86,7 @@ def test_what_a_killed_run_left_is_no_photo(tmp_path):
     ({"left1.png": LARGE, "left2.png": SMALL, "right1.png": SMALL, "right2.png": SMALL}, "left*.png",
      "left2.png: is 32x24 px"),
 ])  # fmt: skip
-def test_photos_that_make_no_pairs_are_refused_by_name(tmp_path, names, left, said):
+def test_photos_without_pairs_are_refused(tmp_path, names, left, said):
     images(tmp_path, names)
     with pytest.raises(CalibrationError) as caught:
         calibrate_photos(tmp_path, left, "right*.png", BoardConfig())

@@ -69,7 +69,7 @@ def test_the_drawn_board_is_found_and_numbered_as_opencv_does(square_px):
     np.testing.assert_allclose(corners[numbers.ravel()], theirs.reshape(-1, 2), atol=1.0)
 
 
-def test_a_part_of_the_board_is_enough():
+def test_charuco_is_found_in_part():
     image = draw_board(BOARD, 40)[:200, 150:]  # the first three rows of corners, without the first two columns
     corners = find_corners(image, BOARD).reshape(6, 8, 2)
     seen = np.isfinite(corners).all(axis=-1)
@@ -87,11 +87,11 @@ def test_a_part_of_the_board_is_enough():
     draw_board(BOARD, 40)[:140],
     np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8),
 ], ids=["nothing", "a plain chessboard", "one row", "noise"])  # fmt: skip
-def test_what_shows_no_board_is_none(image):
+def test_charuco_needs_more_than_one_row(image):
     assert find_corners(image, BOARD) is None
 
 
-def test_it_may_look_the_same_upside_down_but_not_need_too_many_markers():
+def test_charuco_may_have_even_counts_but_not_too_many_markers():
     check_board(BOARD)
     check_board(BoardConfig("charuco", (21, 21)))
     with pytest.raises(ConfigError, match=r"board\.corners"):
@@ -99,7 +99,7 @@ def test_it_may_look_the_same_upside_down_but_not_need_too_many_markers():
 
 
 @pytest.mark.render
-def test_rendered_corners_are_where_they_are():
+def test_charuco_corners_in_rendered_images_are_accurate():
     """All effects on, the board whole and reaching out of the image, up to 3 m."""
     config = parse_config({"board": {"kind": "charuco", "corners": [8, 6], "square": 0.1}})
     errors = []

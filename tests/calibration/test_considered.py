@@ -26,7 +26,7 @@ def found(calibration):
 
 
 @pytest.mark.parametrize("name", ["pan_scale", "tilt_scale"])
-def test_what_a_held_scale_does_is_what_fits_say_that_hold_it_elsewhere(found, name):
+def test_sensitivity_to_a_held_scale_is_that_of_refits(found, name):
     covariance = with_consider_covariance(covariance_of(found), found, POINTS, ["scale"])
     i = covariance.parameters.index(f"head.{name}")
     own = len(parameter_names(ALL_BLOCKS))
@@ -38,7 +38,7 @@ def test_what_a_held_scale_does_is_what_fits_say_that_hold_it_elsewhere(found, n
     np.testing.assert_allclose(by_held / sigmas, expected / sigmas, atol=0.01 * np.abs(expected / sigmas).max())
 
 
-def test_nothing_grows_smaller_and_what_is_free_is_not_considered(found):
+def test_consider_covariance_only_grows(found):
     covariance = covariance_of(found)
     grown = with_consider_covariance(covariance, found, POINTS, ["scale"])
     own = len(covariance.parameters)
@@ -48,7 +48,7 @@ def test_nothing_grows_smaller_and_what_is_free_is_not_considered(found):
     assert with_consider_covariance(covariance, found, POINTS, []) is covariance
 
 
-def test_scales_that_are_off_are_doubted_by_as_much(calibration):
+def test_wrong_scales_widen_the_covariance_by_their_error(calibration):
     """No more than the corners can tell of them: some three ten-thousandths."""
     assert calibration.covariance.sigma("head.pan_scale") == pytest.approx(0.002, abs=0.0012)
     assert calibration.covariance.sigma("head.tilt_scale") == pytest.approx(0.002, abs=0.0012)

@@ -59,7 +59,7 @@ LARGER = [(6, 5), (7, 4), *(pytest.param(it, marks=pytest.mark.slow) for it in (
 
 
 @pytest.mark.parametrize("corners", LARGER)
-def test_part_of_a_larger_board_is_no_board(corners):
+def test_part_of_a_larger_board_is_refused(corners):
     """OpenCV's finders do report the inner part of one, which would be numbered differently in every picture."""
     board = BoardConfig(corners=corners)
     pictures = [
@@ -74,13 +74,13 @@ def test_part_of_a_larger_board_is_no_board(corners):
     np.full((480, 640, 3), 128, np.uint8),
     np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8),
 ], ids=["grey", "noise"])  # fmt: skip
-def test_no_board_is_none(image):
+def test_image_without_a_board_gives_none(image):
     assert find_corners(image, BOARD) is None
     assert guess_corners(image) is None
 
 
 @pytest.mark.parametrize("kind", ["chessboard", "charuco"])
-def test_a_second_board_in_the_picture_is_seen(kind):
+def test_second_board_in_an_image_is_noticed(kind):
     board = BoardConfig(kind)
     one = draw_board(board, 30)
     two = np.concatenate([one, cv2.rotate(one, cv2.ROTATE_180)], axis=1)
@@ -118,7 +118,7 @@ def still_with_board(outline_px):
         ((2900, 2300), (1100, 2200), (1000, 900), (2800, 1000)),
     ],
 )
-def test_the_large_board_of_a_still_is_found_to_a_fraction_of_a_pixel_and_nothing_else(outline_px):
+def test_board_in_a_large_still_is_found_beside_clutter(outline_px):
     still, truth = still_with_board(outline_px)
     corners = find_corners(still, BOARD)
     assert corners is not None
@@ -135,7 +135,7 @@ def test_a_board_too_small_for_the_reduced_still_is_found_at_full_size():
     assert np.abs(corners[0] - (2000 + 23.5, 1000 + 23.5)).max() < STILL_TOLERANCE_PX
 
 
-def test_spacing_is_of_the_corners_that_are_seen():
+def test_smallest_spacing_ignores_corners_not_seen():
     corners = board_points(BoardConfig(corners=(3, 4)))[:, :2] * 100
     corners[0] = np.nan
     assert smallest_spacing(corners, (3, 4)) == pytest.approx(10.0)
@@ -144,7 +144,7 @@ def test_spacing_is_of_the_corners_that_are_seen():
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
 @pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 4])
-def test_real_photos_show_the_board_they_show(every):
+def test_boards_in_real_photos_are_found_and_no_others(every):
     """Its outer squares are cut short, and a screen behind it shows two small boards in some."""
     guesses = []
     for path in sorted(PHOTOS.glob("left*.jpg"))[::every]:

@@ -62,7 +62,7 @@ def example():
     )
 
 
-def test_round_trip(tmp_path):
+def test_calibration_file_round_trip_is_exact(tmp_path):
     path, before = tmp_path / "calibration.json", example()
     save_calibration(path, before)
     after = load_calibration(path)
@@ -86,7 +86,7 @@ def test_round_trip(tmp_path):
     assert list(tmp_path.iterdir()) == [path]  # no temporary file stays
 
 
-def test_optional_parts_may_be_missing(tmp_path):
+def test_calibration_file_may_lack_optional_parts(tmp_path):
     path = tmp_path / "c.json"
     bare = replace(
         with_zoom_head(example(), T_head_zoom=None),
@@ -170,14 +170,14 @@ def test_errors_name_the_file_and_the_key_in_one_line(tmp_path, edit, key):
     (b'{"schema": 1, "board": {}, "pitch_mm": null, "captures": []}', "captures"),
     (b'{"schema": 1, "versions": {}, "config": null}', "session"),
 ])  # fmt: skip
-def test_what_is_no_calibration_at_all(tmp_path, content, what):
+def test_other_files_are_refused_with_what_they_are(tmp_path, content, what):
     path = tmp_path / "c.json"
     path.write_bytes(content)
     with pytest.raises(CalibrationError, match=what):
         load_calibration(path)
 
 
-def test_missing_file_and_folder(tmp_path):
+def test_missing_files_and_folders_are_refused(tmp_path):
     with pytest.raises(CalibrationError, match="no such file"):
         load_calibration(tmp_path / "none.json")
     with pytest.raises(CalibrationError, match="cannot be read"):

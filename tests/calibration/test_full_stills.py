@@ -43,7 +43,7 @@ def rig():
     return rig_of(SimpleNamespace(fixed=object(), zoom=zoom, head=object(), clock=clock, board=object()))
 
 
-def test_everything_else_is_the_rig_s_own(rig):
+def test_stills_change_only_the_zoom_camera(rig):
     closed = []
     rig = replace(rig, release=lambda: closed.append(True))
     assert with_stills(replace(rig, zoom=Viewfinder(rig.clock, Viewfinder.size))).zoom.size == Viewfinder.size
@@ -53,7 +53,7 @@ def test_everything_else_is_the_rig_s_own(rig):
     assert closed == [True]
 
 
-def test_focal_lengths_are_in_the_still_s_pixels(rig):
+def test_focal_lengths_are_in_pixels_of_the_still(rig):
     stills = with_stills(rig)
     zoom, spec = stills.zoom, stills.spec.zoom
     assert (spec.size, spec.focal_range) == (zoom.size, zoom.focal_range)
@@ -64,7 +64,7 @@ def test_focal_lengths_are_in_the_still_s_pixels(rig):
     assert zoom.state() == ZoomState(pytest.approx(500.0 * FACTOR), True, 7.0)
 
 
-def test_every_frame_is_a_still_taken_after_the_time_that_is_asked_for(rig):
+def test_frames_are_stills_taken_after_the_wanted_time(rig):
     """As when a head has just stopped, and its vibrations are to be over."""
     zoom = with_stills(rig).zoom
     for frame in (zoom.read(), zoom.capture(), zoom.read(newer_than=0.0)):
@@ -72,7 +72,7 @@ def test_every_frame_is_a_still_taken_after_the_time_that_is_asked_for(rig):
     assert zoom.read(newer_than=102.0, timeout=5.0).t == pytest.approx(102.0 + EXPOSED_AFTER)
 
 
-def test_nobody_waits_for_ever(rig):
+def test_still_wanted_too_far_ahead_is_refused(rig):
     with pytest.raises(StaleFrameError):
         with_stills(rig).zoom.read(newer_than=109.0, timeout=5.0)
     assert rig.clock.now() == 100.0

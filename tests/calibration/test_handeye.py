@@ -35,7 +35,7 @@ def test_exact_motions_give_t_exactly(angles, dz):
         assert np.linalg.norm(error.translation) < EXACT
 
 
-def test_matrices_are_refused_in_words():
+def test_hand_eye_refuses_matrices():
     with pytest.raises(CalibrationError, match="RigidTransform"):
         solve_hand_eye([np.eye(4)] * 3, [np.eye(4)] * 3)
 
@@ -45,7 +45,7 @@ def test_matrices_are_refused_in_words():
     ([(0.1, 0.0), (0.1, 0.2), (0.1, -0.3)], "only tilt moved"),
     ([(0.1, 0.1), (0.1, 0.1)], "did not move"),
 ])  # fmt: skip
-def test_motions_about_one_axis_are_refused_in_words(angles, message):
+def test_park_martin_refuses_motions_about_one_axis(angles, message):
     with pytest.raises(CalibrationError, match=message):
         park_martin(*exact_motions(pose([0.1, 0.0, 0.0], [1.0, 2.0, 3.0]), angles))
 
@@ -54,7 +54,7 @@ HAND = pose([0.02, -0.08, 0.05], [0.7, -1.4, 0.5])
 ANGLES = [(0.0, 0.0), (0.3, 0.1), (-0.2, 0.3), (0.4, -0.3), (-0.4, -0.2)]
 
 
-def test_a_head_that_counts_the_other_way_is_the_same_head_turned_round():
+def test_reversed_pan_gives_a_t_turned_by_180_degrees():
     _, B = exact_motions(HAND, ANGLES)
     A, _ = exact_motions(HAND, [(-pan, tilt) for pan, tilt in ANGLES])
     turned = pose([0, 0, 0], [180, 0, 0]) * HAND  # Rot(X, pi) Rot(Y, pan) = Rot(Y, -pan) Rot(X, pi)
@@ -71,7 +71,7 @@ WIDE_ANGLES = [(0.0, 0.0), (0.9, 0.3), (-0.8, 0.5), (0.7, -0.6), (-0.9, -0.2)]
     (exact_motions(HAND, ANGLES)[0], [RigidTransform.identity()] * 10, "units"),
 ], ids=["the wrong way round", "pan and tilt exchanged", "a camera that does not turn"])  # fmt: skip
 @pytest.mark.parametrize("solve", [park_martin, solve_hand_eye_from_motions])
-def test_contradictions_are_refused(solve, A, B, said):
+def test_contradicting_motions_are_refused(solve, A, B, said):
     with pytest.raises(CalibrationError, match=said):
         solve(A, B)
 
@@ -144,19 +144,19 @@ def from_motions(starts, ends):
 
 
 @pytest.mark.slow
-def test_poses_give_an_honest_covariance():
+def test_covariance_from_poses_is_consistent():
     rng = np.random.default_rng(0)
     check_honest(from_poses(arm(rng, 20)), from_poses(pan_tilt(rng, 20)))
 
 
 @pytest.mark.slow
-def test_independent_motions_give_an_honest_covariance():
+def test_covariance_from_motions_is_consistent():
     rng = np.random.default_rng(1)
     check_honest(from_motions(arm(rng, 20), arm(rng, 20)), from_motions(pan_tilt(rng, 20), pan_tilt(rng, 20)))
 
 
 @pytest.mark.slow
-def test_it_is_no_worse_than_park_and_martin():
+def test_hand_eye_is_no_worse_than_park_and_martin():
     rng = np.random.default_rng(1)
     hands = arm(rng, 20)
     seen = boards_seen(hands)
@@ -177,7 +177,7 @@ def test_it_is_no_worse_than_park_and_martin():
 
 
 @pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="OpenCV 5 has no calibrateHandEye")
-def test_it_is_no_worse_than_opencv():
+def test_hand_eye_is_no_worse_than_opencv():
     rng = np.random.default_rng(1)
     hands = arm(rng, 20)
     seen = boards_seen(hands)
@@ -210,7 +210,7 @@ def test_exact_poses_give_x_and_the_board(hands):
     assert np.abs(error_of(solve_hand_eye_from_motions(A[:2], B[:2]).X)).max() < EXACT  # two motions do
 
 
-def test_the_residuals_are_those_of_the_noise():
+def test_hand_eye_residuals_equal_the_noise():
     rng = np.random.default_rng(4)
     hands = arm(rng, 100)
     found = solve_hand_eye(hands, [noisy(T, rng) for T in boards_seen(hands)])
@@ -219,7 +219,7 @@ def test_the_residuals_are_those_of_the_noise():
     assert found.rejected == ()
 
 
-def test_several_placements_are_one_answer():
+def test_hand_eye_from_several_placements():
     rng = np.random.default_rng(5)
     hands = pan_tilt(rng, 12)
     boards = {7: BOARD, 3: pose([-1.0, 0.5, 3.0], [0.0, 40.0, 0.0])}
@@ -232,7 +232,7 @@ def test_several_placements_are_one_answer():
 
 
 @pytest.mark.slow
-def test_a_board_seen_best_in_its_middle():
+def test_middle_of_the_board_improves_hand_eye():
     """Noise turns the board about its middle, 0.5 m from its origin: knowing where helps."""
     rng = np.random.default_rng(6)
     hands = pan_tilt(rng, 20)
@@ -259,7 +259,7 @@ def test_gross_errors_are_found_and_left_out(hands):
     assert e @ np.linalg.solve(clean.covariance, e) < chi2.ppf(0.9, 6)  # two poses of twenty fewer
 
 
-def test_the_same_poses_give_the_same_answer():
+def test_hand_eye_is_deterministic_and_independent_of_order():
     rng = np.random.default_rng(8)
     hands = arm(rng, 15)
     seen = [noisy(T, rng) for T in boards_seen(hands)]
@@ -299,7 +299,7 @@ ALONG = 0.02  # how far directions found with noise may lean
 
 @pytest.mark.parametrize("case", UNDETERMINED)
 @pytest.mark.parametrize("from_poses", [True, False])
-def test_what_is_free_is_said_and_stays_uncertain(case, from_poses):
+def test_undetermined_directions_are_named_and_stay_uncertain(case, from_poses):
     hands, names, free = UNDETERMINED[case]
     rng = np.random.default_rng(10)
     seen = [noisy(T, rng, 1e-3, 1e-3) for T in boards_seen(hands)]
@@ -326,7 +326,7 @@ def test_what_is_free_is_said_and_stays_uncertain(case, from_poses):
     assert found.translation_rms < 2e-2  # axes, with the board's distance of 4 m as a lever
 
 
-def test_what_is_free_is_as_small_as_can_be():
+def test_regularized_hand_eye_is_smallest_in_undetermined_directions():
     hands = head([(-15, 0), (-5, 0), (0, 0), (10, 0)])
     found = solve_hand_eye(hands, boards_seen(hands), regularize=True).X
     assert abs(found.translation[1]) < EXACT  # along the pan axis
@@ -336,7 +336,7 @@ def test_what_is_free_is_as_small_as_can_be():
     assert found.rotation.magnitude() == pytest.approx(turned.magnitude().min(), abs=1e-5)  # the grid's steps squared
 
 
-def test_motions_too_small_for_their_noise():
+def test_motions_too_small_for_their_noise_are_refused():
     rng = np.random.default_rng(11)
     hands = head(rng.uniform(-0.6, 0.6, (10, 2)))
     seen = [noisy(T, rng) for T in boards_seen(hands)]
@@ -344,7 +344,7 @@ def test_motions_too_small_for_their_noise():
         solve_hand_eye(hands, seen)
 
 
-def test_noise_of_the_hand_is_no_second_axis():
+def test_noise_of_the_hand_does_not_pass_for_a_second_axis():
     """With the hand's own pose noisy, axes scatter and a planar arm looks as if it could tell its height."""
     rng = np.random.default_rng(12)
     for _ in range(20):
@@ -353,7 +353,7 @@ def test_noise_of_the_hand_is_no_second_axis():
             solve_hand_eye(hands, [noisy(T, rng, 1e-3, 1e-3) for T in boards_seen(PLANAR)])
 
 
-def test_too_few_views_are_refused():
+def test_hand_eye_refuses_too_few_views():
     with pytest.raises(CalibrationError, match="1 and 1 motions"):
         solve_hand_eye_from_motions([X], [X])
     with pytest.raises(CalibrationError, match="three views"):

@@ -23,7 +23,7 @@ MOST_WIDENED = 1  # of six, where the threshold of three standard deviations is 
 
 
 @pytest.mark.slow
-def test_an_exact_model_predicts_what_it_has_not_seen():
+def test_exact_model_predicts_held_out_placements():
     ratios, widened = [], 0
     for truth in RIGS:
         start = model_of(calibrated(drawn(truth, 99, BOARDS)))
@@ -51,7 +51,7 @@ SAME_FIT = 1e-3  # a fit stops within a thousandth of a standard deviation of it
 
 
 @pytest.mark.parametrize("stops", [(), (fourfold(2 * NOMINAL_PX),)], ids=["one focal length", "two"])
-def test_what_is_measured_is_the_miss_of_the_prediction(stops):
+def test_held_out_miss_is_that_of_a_prediction_by_hand(stops):
     """Every fold predicted by hand: OpenCV's pose of the board, and the head's matrices written out.
 
     A miss counts in pixels of the shortest focal length.
@@ -89,7 +89,7 @@ THIN_PRISM = (-0.2, 0, 0, 0, 0, 0, 0, 0, 0.012, 0.008, -0.008, 0.004)  # some 0.
     replace(Truth(), sag=np.radians(0.3)),
     replace(Truth(), zoom=Lens(692.0, 693.0, 326.0, 235.0, THIN_PRISM)),
 ], ids=["sag", "thin prism"])  # fmt: skip
-def test_what_the_head_seems_to_do_becomes_jitter(truth):
+def test_unmodelled_errors_of_the_head_become_jitter(truth):
     assert calibrated(drawn(truth, 0, BOARDS)).jitter > 0
 
 
@@ -109,7 +109,7 @@ def test_a_fixed_lens_of_another_kind_widens_the_uncertainty():
     assert found.jitter == pytest.approx(plain.jitter * factor, rel=SAME_FIT)
 
 
-def test_too_few_placements_tell_nothing():
+def test_too_few_placements_give_no_held_out_check():
     views = drawn(Truth(), 0, boards=4)
     start = model_of(calibrated(views))
     found = fitted(start, views)
@@ -121,7 +121,7 @@ def test_too_few_placements_tell_nothing():
     assert cross_validate(half, POINTS, None, folds=3).views == sum(v.camera == "zoom" for v in views if v.board > 0)
 
 
-def test_placements_that_do_not_determine_the_rig_without_another_tell_nothing():
+def test_undetermined_folds_give_no_held_out_check():
     start = model_of(calibrated(drawn(Truth(), 99, BOARDS)))
     once = fitted(start, drawn(Truth(), 0, boards=6, looks=1))
     assert cross_validate(once, POINTS, None, folds=5) is None

@@ -52,7 +52,7 @@ def calibration(views):
     return calibrated(views)
 
 
-def test_the_truth_is_where_it_says(calibration):
+def test_truth_is_within_the_predicted_uncertainty(calibration):
     assert largest_pull(calibration, Truth()) < PULL
     measured, predicted = pointing(calibration, Truth())
     assert measured < POINTING_FACTOR * predicted
@@ -134,7 +134,7 @@ AIM_SEEDS = 3
 
 
 @pytest.mark.slow
-def test_a_jittery_head_is_noticed_and_its_pointing_predicted():
+def test_jitter_is_estimated_and_its_pointing_error_predicted():
     truth = replace(Truth(), jitter=JITTER)
     jitters, with_head, without = [], [], []
     for seed in range(SEEDS):
@@ -198,7 +198,7 @@ KNOWN_TURN = np.radians(0.2)
 LOOSE_SIGMAS = 0.01
 
 
-def test_pan_alone_is_refused_or_owned_up_to(views, calibration):
+def test_pan_alone_is_refused_or_regularized_with_its_uncertainty(views, calibration):
     only_pan = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=10, tilt_range=0.0)
     with pytest.raises(CalibrationError, match=r"only pan moved: .* along the pan axis and .* about it .* tilt"):
         calibrated(only_pan)
@@ -220,7 +220,7 @@ CUT_SHARE = 0.6  # of the views
 CUT_GROWTH = (1.1, 2.0)
 
 
-def test_boards_seen_in_part(views, calibration):
+def test_boards_seen_in_part_calibrate_with_less_precision(views, calibration):
     rng = np.random.default_rng(4)
     column, row = np.tile(np.arange(COLUMNS), ROWS), np.repeat(np.arange(ROWS), COLUMNS)
     halves = (row < ROWS / 2, row >= ROWS / 2, column < COLUMNS / 2, column >= COLUMNS / 2)

@@ -43,7 +43,7 @@ def test_exact_corners_give_the_truth_exactly():
     (Truth(), (0.05, 0.10), (0.010, 0.020)),
     pytest.param(other_rig(), (0.08, 0.16), (0.010, 0.020), marks=pytest.mark.slow),
 ], ids=["default", "other"])  # fmt: skip
-def test_noisy_corners_point_well_enough(truth, bounds, refined_bounds):
+def test_calibration_from_noisy_corners_points_well(truth, bounds, refined_bounds):
     views = synthetic_views(truth, POINTS, np.random.default_rng(1))
     for method, (median, p95) in (("sequential", bounds), ("joint", refined_bounds)):
         calibration = calibrated(views, method)
@@ -184,7 +184,7 @@ def test_two_cameras_without_a_head_must_stand_still():
     assert step_by_step.residuals.stereo_rms_px < 0.28
 
 
-def test_what_cannot_be_calibrated_is_refused_in_words():
+def test_views_that_cannot_be_calibrated_are_refused():
     views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=3)
     with pytest.raises(CalibrationError, match="fixed camera"):
         calibrated([])
@@ -199,7 +199,7 @@ def test_what_cannot_be_calibrated_is_refused_in_words():
 
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
-def test_real_photos():
+def test_real_photos_calibrate_to_known_residuals():
     calibration = calibrate_photos(PHOTOS, "left*.jpg", "right*.jpg", PHOTO_BOARD)
     residuals = calibration.residuals
     assert (residuals.fixed_views, residuals.zoom_views, residuals.pairs) == (13, 13, 13)

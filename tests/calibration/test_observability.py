@@ -45,7 +45,7 @@ def lens_normal(board_poses, focal=692.0):
 LENS_NAMES = [f"fixed.{name}" for name in LENS]
 
 
-def test_boards_that_face_the_camera_say_nothing_of_its_focal_length():
+def test_boards_facing_the_camera_leave_its_focal_length_open():
     flat = [pose([x, y, 3.0], [0, 0, turn]) for x, y, turn in ((0.5, 0.3, 0), (-0.6, 0.2, 40), (0.1, -0.5, -70))]
     weak = weak_directions(lens_normal(flat), LENS_NAMES, SIGMA_PX**2)
     text = name_directions(LENS_NAMES, weak)
@@ -55,7 +55,7 @@ def test_boards_that_face_the_camera_say_nothing_of_its_focal_length():
     assert not len(weak_directions(lens_normal(flat + tilted), LENS_NAMES, SIGMA_PX**2))
 
 
-def test_at_a_long_focal_length_the_limits_are_those_of_the_image():
+def test_limits_of_use_scale_with_the_focal_length():
     """At 7000 px k1 bends the picture so little that nobody misses it."""
     boards = [
         pose([x, y, z], [a, b, 0])
@@ -104,14 +104,14 @@ OF_HEAD = ("axis offset", "squareness")
     ([(0.0, 0.0)], "T_head_zoom's position, T_head_zoom's rotation", OF_HEAD),
     ([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.1), (0.1, 0.25)], "", ()),
 ])  # fmt: skip
-def test_a_head_that_moves_too_little(angles, begins, free):
+def test_head_that_moves_too_little_is_named(angles, begins, free):
     text = name_directions(HAND_NAMES, weak_directions(hand_normal(angles), HAND_NAMES, SIGMA_PX**2))
     assert text.startswith(begins)
     assert all(words in text for words in free)
     assert bool(text) == bool(begins)
 
 
-def test_directions_are_the_null_space_whatever_spans_it():
+def test_weak_directions_are_the_null_space():
     rng = np.random.default_rng(0)
     normal = hand_normal([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.0)])
     weak = weak_directions(normal, HAND_NAMES, SIGMA_PX**2)
@@ -123,7 +123,7 @@ def test_directions_are_the_null_space_whatever_spans_it():
 
 
 @pytest.mark.parametrize(("sigma", "weak"), [(4.9, 0), (5.1, 1)])
-def test_the_limit_is_five_degrees(sigma, weak):
+def test_limit_of_use_of_a_rotation_is_five_degrees(sigma, weak):
     names = ["T_zoom0_fixed.ry"]
     normal = np.array([[1.0]]) / np.radians(sigma) ** 2
     assert len(weak_directions(normal, names, 1.0)) == weak
@@ -136,14 +136,14 @@ def test_the_limit_is_five_degrees(sigma, weak):
     ("head.pan_scale", "the head's scale of pan", "add pan"),
     ("T_head_zoom.tz", "T_head_zoom's position", "nearer"),
 ])  # fmt: skip
-def test_one_parameter_alone(name, free, add):
+def test_single_undetermined_parameter_is_named_with_advice(name, free, add):
     names = ["fixed.fx", name]
     text = name_directions(names, weak_directions(np.diag([1.0, 0.0]), names, 0.0))
     assert text.startswith(f"{free} is free; ")
     assert add in text
 
 
-def test_nothing_weak_and_names_nobody_knows():
+def test_no_direction_has_no_name_and_unknown_parameters_are_refused():
     assert name_directions(["fixed.fx"], np.empty((0, 1))) == ""
     with pytest.raises(CalibrationError, match=r"'fixed\.k9' is no parameter"):
         weak_directions(np.eye(1), ["fixed.k9"], 1.0)

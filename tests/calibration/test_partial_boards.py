@@ -94,7 +94,7 @@ def test_corners_in_view_are_found_and_numbered(views, how):
     assert np.abs(error).max() < WORST_PX
 
 
-def test_predictions_may_be_missing(views):
+def test_find_near_works_with_missing_predictions(views):
     image, truth = views[4]
     predicted = truth.copy()
     predicted[:9] = np.nan
@@ -136,7 +136,7 @@ def test_a_prediction_two_squares_off_is_refused_where_an_edge_across_is_in_view
     lambda image: np.random.default_rng(0).integers(0, 255, image.shape, dtype=np.uint8),
     lambda image: np.full_like(image, 128),
 ], ids=["blurred", "moved", "half covered", "noise", "nothing"])  # fmt: skip
-def test_what_shows_no_board_is_none(views, spoil):
+def test_find_near_refuses_images_without_a_board(views, spoil):
     for image, truth in views:
         corners = find_near(spoil(image), BOARD, spoiled(truth, (3.0, -2.0), 1.01))
         # Where all that is in view lies in the half that is left, it may be found, and rightly.

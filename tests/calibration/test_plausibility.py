@@ -94,7 +94,7 @@ IMPLAUSIBLE = {
 
 
 @pytest.mark.parametrize("name", IMPLAUSIBLE)
-def test_what_no_rig_is_like_is_refused_unless_insisted_on(name):
+def test_implausible_calibration_is_refused_unless_insisted_on(name):
     calibration, wanted = IMPLAUSIBLE[name]
     with pytest.raises(CalibrationError, match=wanted):
         check_plausible(calibration)
@@ -103,15 +103,15 @@ def test_what_no_rig_is_like_is_refused_unless_insisted_on(name):
 
 @pytest.mark.parametrize("with_views", [True, False])
 @pytest.mark.parametrize("truth", [Truth(), other_rig()])
-def test_rigs_of_another_build_pass(truth, with_views):
+def test_unusual_rigs_are_plausible(truth, with_views):
     check_plausible(calibration_of(truth, with_views=with_views))
 
 
-def test_a_calibration_for_smaller_streams_passes():
+def test_calibration_for_smaller_streams_is_plausible():
     check_plausible(GOOD.for_streams((320, 240), (320, 240)))
 
 
-def test_another_lens_is_another_rig():
+def test_calibration_of_another_lens_is_refused():
     own = list(SPEC.zoom.focal_range)
     check_plausible(replace(GOOD, provenance={"focal_range_px": own}), SPEC)
     check_plausible(GOOD, SPEC)  # captures of another program do not say what the lens can do

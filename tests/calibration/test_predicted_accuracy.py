@@ -50,7 +50,7 @@ def fitted(start, views):
     return fit(place_boards(start, views, POINTS), views, POINTS, ALL_BLOCKS)
 
 
-def test_its_error_is_that_of_the_calibration(found, predicted):
+def test_predicted_accuracy_is_that_of_the_calibration(found, predicted):
     model = found.model
     calibration = Calibration(model.fixed, model.zoom_head, covariance=covariance_of(found))
     across, down = (np.linspace(BORDER, 1 - BORDER, count) for count in ACCURACY_GRID)
@@ -63,7 +63,7 @@ def test_its_error_is_that_of_the_calibration(found, predicted):
 REAL_TOLERANCE = 0.1
 
 
-def test_what_was_promised_is_kept(start, found, predicted):
+def test_predicted_accuracy_of_planned_views_is_reached(start, found, predicted):
     """Really taken twice, with other noise; and one placement more, really taken."""
     exact, rng = drawn(0, noise_px=0.0), np.random.default_rng(1)
     more = [
@@ -83,7 +83,7 @@ def test_what_was_promised_is_kept(start, found, predicted):
 HOPELESS = np.radians(10.0)
 
 
-def test_what_is_open_has_no_good_outlook(start, predicted):
+def test_undetermined_rig_has_a_large_predicted_error(start, predicted):
     assert replace(predicted, normal=np.zeros_like(predicted.normal)).error() == np.inf
     only_pan = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=BOARDS, tilt_range=0.0)
     assert predict_accuracy(fitted(start, only_pan), BOARD.square).error() > HOPELESS

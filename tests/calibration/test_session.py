@@ -37,7 +37,7 @@ def session(tmp_path_factory):
     return truth, calibration, directory, told
 
 
-def test_a_rig_of_which_nothing_is_known_points_well(session):
+def test_session_calibrates_an_unknown_rig(session):
     truth, calibration, _, _ = session
     errors = pointing_errors(calibration, truth, np.random.default_rng(5), 40)
     # Usual are 0.002 and 0.005 degrees; a mistake of numbering or of order is off by degrees.
@@ -60,7 +60,7 @@ def test_the_plan_covers_both_images_near_and_far(session):
     assert calibration.residuals.pairs >= 8
 
 
-def test_progress_ends_where_it_said(session):
+def test_progress_counts_up_to_its_total(session):
     told = session[3]
     assert told[-1][0] == told[-1][1] == 18
     assert all(b[0] >= a[0] for a, b in itertools.pairwise(told))
@@ -79,7 +79,7 @@ def test_captures_give_the_same_calibration(session):
         calibrate(SyntheticRig(), BOARD, captures_dir=directory)
 
 
-def test_a_session_that_is_killed_leaves_every_image_in_the_index(tmp_path):
+def test_index_lists_every_image_at_once(tmp_path):
     """Also those of the placement that is under way: in the zoom stage one of them holds many."""
     recorder = CaptureRecorder(SyntheticRig(), BOARD, tmp_path)
     recorder.start()
@@ -92,7 +92,7 @@ def test_a_session_that_is_killed_leaves_every_image_in_the_index(tmp_path):
         assert len(read_index(tmp_path).captures) == count
 
 
-def test_a_session_leaves_what_rig_it_was_and_what_it_was_told_to_do(tmp_path):
+def test_session_writes_its_config_and_commands(tmp_path):
     config = parse_config({"hardware": {"fixed": {"password": "secret", "url": "http://me:secret@server"}}})
     rig = SyntheticRig()
     rig.config = config
@@ -127,13 +127,13 @@ NARROW = PanTiltLimits((-0.4, 0.4), (-0.4, 0.4), 2.6, 3.6, 0.0009)
     ({"truth": Truth(gamma=pose([0, 0, 0], [0, 180, 0])), "limits": NARROW}, "the zoom camera does not see the board"),
     ({"board_config": BoardConfig(corners=(7, 6))}, "the fixed camera does not see the 9x6 board"),
 ])  # fmt: skip
-def test_a_broken_rig_is_refused_in_one_line(broken, message):
+def test_broken_rig_is_refused_in_one_line(broken, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         calibrate(SyntheticRig(**broken), BOARD)
     assert "\n" not in str(caught.value)
 
 
-def test_a_lens_that_reports_two_thirds_of_its_focal_length_is_calibrated_all_the_same():
+def test_wrong_nominal_focal_length_is_corrected():
     found = calibrate(SyntheticRig(told=478 / 692), BOARD, placements=8)
     shortest = found.zoom_head.lens.stops[0]
     assert shortest.focal_px[0] == pytest.approx(Truth().zoom.fx, rel=0.01)  # 8 placements know it to 0.2 %
@@ -206,7 +206,7 @@ def test_a_head_that_was_stopped_is_not_sent_again(error):
 
 @pytest.mark.parametrize("camera", ["fixed", "zoom"])
 @pytest.mark.parametrize("times", [1, 2, 3])
-def test_a_late_frame_is_waited_for_again_with_the_head_where_it_should_be(camera, times):
+def test_late_frame_is_read_again_after_the_head_is_sent_again(camera, times):
     made = Failing(frames=[LATE] * times)
     recorder = CaptureRecorder(made.rig, BOARD)
     recorder.turn(0.5, 0.1)

@@ -61,7 +61,7 @@ POINTING_TOLERANCE = 0.25
 
 
 @pytest.mark.slow
-def test_the_covariance_is_honest():
+def test_covariance_is_consistent():
     half = SEEDS // 2
     rigs = [honesty(truth, half, outliers) for truth, outliers in ((Truth(), 0.0), (other_rig(), 0.05))]
     lowest, highest = (binom.ppf(p, SEEDS, 0.9) / SEEDS for p in (BY_CHANCE, 1 - BY_CHANCE))
@@ -100,7 +100,7 @@ WANDERED = 5 * 641 / 640
     (("T_zoom0_fixed.tz", "T_zoom0_fixed.rz"), [[0.01, 0], [0, 0.01]], 500.0, [[0, 0], [0, 0]]),
     (("T_head_zoom.tx", "T_head_zoom.ry"), [[0.01, 0], [0, 0.01]], 500.0, [[0, 0], [0, 0]]),  # the head has not moved
 ])  # fmt: skip
-def test_worked_by_hand(parameters, matrix, nominal, expected):
+def test_line_of_sight_covariance_by_hand(parameters, matrix, nominal, expected):
     found = line_of_sight_covariance(ideal(parameters, matrix), np.array([320.0, 240.0]), 10.0, nominal_px=nominal)
     assert np.allclose(found, expected, rtol=1e-6, atol=1e-12)  # by differences of 1e-5
 
@@ -148,7 +148,7 @@ def calibration(views):
     return calibrated(views)
 
 
-def test_every_free_parameter_has_its_place(calibration):
+def test_covariance_covers_every_free_parameter(calibration):
     covariance = calibration.covariance
     assert covariance.parameters == parameter_names(ALL_BLOCKS)
     assert len(covariance.parameters) == 8 + 8 + 6 + 6 + 2 + 2
@@ -159,7 +159,7 @@ def test_every_free_parameter_has_its_place(calibration):
     assert max(abs(error[n]) / s for n, s in zip(covariance.parameters, sigmas, strict=True)) < 5
 
 
-def test_a_scaled_stream_points_as_well(calibration):
+def test_predicted_pointing_of_a_scaled_stream_is_the_same(calibration):
     pixel = np.array([500.0, 100.0])
     half = calibration.for_streams((320, 240), (320, 240))
     assert float(predicted_pointing(half, (pixel + 0.5) / 2 - 0.5, 8.0)) == pytest.approx(
@@ -167,7 +167,7 @@ def test_a_scaled_stream_points_as_well(calibration):
     )
 
 
-def test_the_budget_of_an_aim_includes_it(calibration):
+def test_error_budget_includes_the_calibration(calibration):
     pixel, reach = np.array([500.0, 100.0]), Reach((-1.5, 1.5), (-1.0, 1.0), (667.0, 7000.0), step=0.001)
     found = aim(calibration, point_at(calibration, pixel, 8.0), reach, nominal_px=2000.0)
     budget = error_budget(calibration, pixel, found, reach, size_px=40.0)
@@ -178,7 +178,7 @@ def test_the_budget_of_an_aim_includes_it(calibration):
     assert set(without) == {"steps", "pixel", "total"}
 
 
-def test_where_there_is_none(views, calibration):
+def test_pointing_without_covariance_or_t_is_refused(views, calibration):
     sequential_only = calibrated(views, "sequential")
     assert sequential_only.covariance is None
     with pytest.raises(CalibrationError, match="no covariance"):
@@ -189,7 +189,7 @@ def test_where_there_is_none(views, calibration):
         predicted_pointing(pair_only, np.array([320.0, 240.0]), 8.0)
 
 
-def test_what_the_views_leave_open_has_no_covariance():
+def test_undetermined_fit_has_no_covariance():
     lens = Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0))
     model, off = BundleModel({0: RigidTransform.identity()}, FixedCamera(lens)), np.full((2, 20, 2), 0.1)
 

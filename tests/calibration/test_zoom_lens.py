@@ -59,7 +59,7 @@ def at(calibration, nominal_px):
     )
 
 
-def test_every_stop_is_found(session):
+def test_session_finds_every_zoom_sample(session):
     calibration, _ = session
     assert calibration.zoom_head.lens.nominal_px == pytest.approx(FOCAL_LENGTHS[::2])
     assert {view.focal_px for view in calibration.views if view.camera == "zoom"} == set(
@@ -71,7 +71,7 @@ def test_every_stop_is_found(session):
 
 
 @pytest.mark.parametrize("nominal", FOCAL_LENGTHS, ids=lambda n: f"{n:.0f}px")
-def test_it_points_over_the_whole_range(session, nominal):
+def test_calibration_points_over_the_whole_focal_range(session, nominal):
     calibration, _ = session
     stop = fourfold(nominal)
     found, true = at(calibration, nominal), zoomed(Truth(), stop)
@@ -130,7 +130,7 @@ def lens_of(centers, step=2.0):
     return ZoomLens(tuple(nominal), tuple(stops))
 
 
-def test_the_doubt_about_the_center_between_stops():
+def test_principal_point_uncertainty_between_and_beyond_zoom_samples():
     lens = lens_of([(320.0, 240.0), (328.0, 236.0), (328.0, 236.0), (320.0, 240.0)])
     for nominal in lens.nominal_px:
         assert np.allclose(lens.center_doubt_px(nominal), 0.0, atol=ROUNDING)
@@ -147,7 +147,7 @@ def test_the_doubt_about_the_center_between_stops():
             assert np.allclose(lens.center_doubt_px(beyond), 1.5 * WANDER_PX)
 
 
-def test_the_next_stop_is_guessed_to_go_on_as_the_last_two_went():
+def test_next_zoom_sample_continues_the_trend_of_the_last_two():
     """From one octave to the next the axis moves by (8, -4) px, and the true focal length grows by 1 % more."""
     first = Intrinsics(SIZE, (NOMINAL_PX, NOMINAL_PX), (320.0, 240.0), (-0.1, 0.0, 0.0, 0.0, 0.0))
     second = replace(first.scaled(2 * 1.01), center_px=(328.0, 236.0), distortion=(-0.4, 0.0, 0.0, 0.0, 0.0))
@@ -161,7 +161,7 @@ def test_the_next_stop_is_guessed_to_go_on_as_the_last_two_went():
     assert guessed.pupil == (0.0, -0.02, -0.02)
 
 
-def test_the_doubt_covers_what_interpolation_misses():
+def test_principal_point_uncertainty_covers_the_interpolation_error():
     """The axis of the fourfold lens, known at four stops exactly."""
     nominal = FOCAL_LENGTHS[::2]
     true = [fourfold(n).lens for n in nominal]

@@ -102,7 +102,7 @@ def read(page):
     return reader
 
 
-def test_the_page_has_everything_and_needs_nothing(stops, plain, tmp_path):
+def test_page_is_complete_and_self_contained(stops, plain, tmp_path):
     path = tmp_path / "r.html"
     found = write_report(path, stops, "stops.json")
     page = path.read_text()
@@ -144,7 +144,7 @@ def test_numbers_in_the_page_are_those_of_the_calibration(plain, tmp_path):
     shift = plain.zoom_head.T_zoom0_fixed.translation[0] * 1000
     assert float(re.search(r"position x (-?[\d.]+) ±", text).group(1)) == pytest.approx(shift, abs=0.5)
     assert "distance measured 0.123 px distance predicted 0.0456 px" in text
-    assert "every distance over what was predicted of it 1.95" in text
+    assert "each distance over its predicted value 1.95" in text
     assert "They disagree: the miss is 2.0 times what it should be" in text
     assert "0.020 degrees an axis" in text
     assert "9 images, 3 single corners" in text
@@ -155,7 +155,7 @@ def test_numbers_in_the_page_are_those_of_the_calibration(plain, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_verdict_is_as_true_as_it_says(plain, stops):
+def test_verdict_agrees_with_the_measured_pointing_error(plain, stops):
     for calibration in (plain, stops):
         said = float(re.match(r"Points to ([\d.]+) degrees", judge(calibration).text).group(1))
         errors = pointing_errors(calibration, Truth(), np.random.default_rng(1), 30)
@@ -169,7 +169,7 @@ def test_the_verdict_is_as_true_as_it_says(plain, stops):
     )
 
 
-def test_the_verdict_speaks_of_focal_lengths_between_the_stops(stops):
+def test_verdict_names_the_worst_focal_length_between_zoom_samples(stops):
     found = analyse(stops)
     at = found.at
     worse = replace(at[0], focal_px=1000.0, rms=2 * max(one.rms for one in at))
@@ -198,13 +198,13 @@ def without_covariance(method):
     (lambda c: {"zoom_head": replace(c.zoom_head, T_head_zoom=None)}, "unknown", "without a head"),
     (lambda c: {"provenance": {"focal_range_px": [667.0, 2001.0]}}, "care", "the lens goes to 2001 px"),
 ])  # fmt: skip
-def test_the_verdict_says_the_plain_truth(plain, changed, level, said):
+def test_verdict_levels(plain, changed, level, said):
     found = judge(bare(plain, **changed(plain)))
     assert found.level == level
     assert said in found.text
 
 
-def test_a_wrong_model_leaves_nothing_undetermined(plain):
+def test_widening_does_not_make_parameters_undetermined(plain):
     """However far it has captures miss; what is undetermined is still said."""
     scaled = plain.covariance.scaled
     wide, held_out = scaled(dict.fromkeys(plain.covariance.parameters, 3e3)), replace(plain.held_out, widened=3000.0)
@@ -234,7 +234,7 @@ def partial_calibrations():
 
 
 @pytest.mark.parametrize(("has_head", "changes"), partial_calibrations().values(), ids=partial_calibrations())
-def test_a_calibration_that_lacks_something_has_a_page_too(plain, has_head, changes, tmp_path):
+def test_page_of_an_incomplete_calibration(plain, has_head, changes, tmp_path):
     calibration = bare(plain if has_head else with_zoom_head(plain, T_head_zoom=None), **changes)
     found = write_report(tmp_path / "r.html", calibration)
     page = (tmp_path / "r.html").read_text()
@@ -243,7 +243,7 @@ def test_a_calibration_that_lacks_something_has_a_page_too(plain, has_head, chan
     assert " nan" not in text_of(page)
 
 
-def test_stored_corners_give_back_their_noise(plain):
+def test_residuals_of_stored_corners_equal_their_noise(plain):
     evidence = gather(plain)
     for corners in evidence.corners.values():
         assert corners.sigma == pytest.approx(NOISE_PX, rel=0.1)
@@ -261,7 +261,7 @@ def one_line(view, seen=slice(0, 5)):
     return replace(view, corners_px=corners, source="line.png")
 
 
-def test_a_view_of_corners_on_one_line_is_named_and_ends_no_report(plain, caplog):
+def test_view_with_corners_on_one_line_is_left_out_of_the_report(plain, caplog):
     for bad in (
         one_line(plain.views[0]),
         one_line(plain.views[0], slice(0, 40, 10)),  # the diagonal
@@ -275,7 +275,7 @@ def test_a_view_of_corners_on_one_line_is_named_and_ends_no_report(plain, caplog
         assert caplog.messages == ["line.png: not in the report: its corners are too few, or all on one line"]
 
 
-def test_a_lens_that_zooms_further_than_was_calibrated_is_told(plain):
+def test_advice_names_an_uncalibrated_focal_range(plain):
     longest = plain.zoom_head.lens.nominal_px[-1]
     for factor, told in ((1, False), (3, True)):
         changed = replace(plain, provenance={"focal_range_px": [667.0, factor * longest]})
@@ -283,7 +283,7 @@ def test_a_lens_that_zooms_further_than_was_calibrated_is_told(plain):
         assert any("but was calibrated to 667 px" in item for item in said) == told
 
 
-def test_a_wavy_board_is_seen_and_said(plain):
+def test_wavy_board_is_noticed(plain):
     bent = POINTS.copy()
     bent[:, 2] = 0.003 * np.sin(12 * POINTS[:, 0])  # waves, which no parabola takes up
     flat = np.polyval(np.polyfit(POINTS[:, 0], bent[:, 2], 1), POINTS[:, 0])  # what a pose takes up
@@ -301,7 +301,7 @@ def test_a_wavy_board_is_seen_and_said(plain):
     assert not gather(plain).shape.wrong
 
 
-def test_a_pattern_in_the_residuals_and_a_bare_corner_are_seen():
+def test_patterns_in_residuals_and_empty_corners_are_noticed():
     rng = np.random.default_rng(0)
     at = rng.uniform([0, 0], [640, 480], (8000, 2))
     at = at[~((at[:, 0] > 400) & (at[:, 1] < 200))]
@@ -336,7 +336,7 @@ def test_advice_follows_from_the_figures(plain):
 
 
 @pytest.mark.slow
-def test_more_placements_take_nothing_from_the_jitter_nor_from_a_lens_between_its_stops(plain, stops):
+def test_more_placements_do_not_reduce_jitter_or_interpolation_error(plain, stops):
     (exact,) = pointing(plain)
     assert what_stays(plain, exact) == 0.0
     assert with_more_placements(plain, exact, 36) == pytest.approx(exact.rms / 2)  # 12 placements and 36 more
@@ -358,13 +358,13 @@ def test_more_placements_take_nothing_from_the_jitter_nor_from_a_lens_between_it
     }
 
 
-def test_what_is_left_when_a_parameter_is_known():
+def test_conditional_covariance_is_the_schur_complement():
     covariance = Covariance(("a", "b"), np.array([[4.0, 2.0], [2.0, 3.0]]))
     left = given(covariance, np.array([False, True])).matrix
     assert left == pytest.approx(np.array([[4 - 2 * 2 / 3, 0], [0, 0]]))  # Schur's complement
 
 
-def test_curves_of_the_zoom_lens_are_as_uncertain_as_the_stops(stops):
+def test_lens_curves_have_the_uncertainty_of_the_zoom_samples(stops):
     curves = lens_curves(stops)
     for where, i in ((0, 0), (-1, 1)):
         nominal = stops.zoom_head.lens.nominal_px[i]
@@ -378,7 +378,7 @@ def test_curves_of_the_zoom_lens_are_as_uncertain_as_the_stops(stops):
     assert correlations(stops)
 
 
-def test_numbers_as_people_read_them():
+def test_number_formatting():
     assert [digits(x) for x in (0.00213, 0.0996, 12.4, 7155.0, 0.0)] == ["0.0021", "0.10", "12", "7200", "0"]
     assert value_and_sigma(692.3149, 0.237) == "692.31 ± 0.24"
     assert value_and_sigma(-1.5, 0.0996) == "-1.50 ± 0.10"
@@ -387,7 +387,7 @@ def test_numbers_as_people_read_them():
     assert [percent(x) for x in (0.0004, 0.03, 1.0)] == ["0.04 %", "3 %", "100 %"]
 
 
-def test_mistakes_end_in_one_line_and_leave_the_page(plain, tmp_path, capsys):
+def test_report_command_fails_in_one_line_and_keeps_the_old_page(plain, tmp_path, capsys):
     source, page = tmp_path / "calibration.json", tmp_path / "page.html"
     save_calibration(source, bare(plain, covariance=None))
     page.write_text("old")
@@ -413,7 +413,7 @@ def test_mistakes_end_in_one_line_and_leave_the_page(plain, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_full_disk_leaves_nothing_of_a_report(plain, tmp_path):
+def test_full_disk_leaves_no_partial_report(plain, tmp_path):
     """There is room for some of its pictures, and none for the page."""
     page = tmp_path / "page.html"
     with full_disk(60_000), pytest.raises(ConfigError, match=f"page.html: cannot be written: {SAID}"):
