@@ -421,10 +421,10 @@ class Evaluation:
     model: BundleModel
     predictions: list[Prediction]
     residuals: list[Array]  # predicted minus observed, (v, N, 2) [px]; 0 for corners that are not seen
-    after: list[Array]  # residuals after each view's pan and tilt are fitted within the jitter, (v, N, 2) [px]
-    given: float  # sum of the squared changes of pan and tilt [rad^2]
+    adjusted: list[Array]  # residuals after each view's pan and tilt are fitted within the jitter, (v, N, 2) [px]
+    squared_turns: float  # sum of the squared changes of pan and tilt [rad^2]
     finite: bool  # False where a board is behind a camera
-    sigma: float  # robust standard deviation of a coordinate of ``after`` [px]
+    sigma: float  # robust standard deviation of a coordinate of ``adjusted`` [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -446,30 +446,30 @@ class Problem:
         ]
         finite = all(np.isfinite(r).all() for r in residuals)
         sigma = robust_sigma(self._seen(residuals)) if finite else np.nan
-        after, given = residuals, 0.0
+        adjusted, squared_turns = residuals, 0.0
         if self.jitter and finite:
             penalty = (sigma / self.jitter) ** 2
-            after = []
+            adjusted = []
             for batch, p, r in zip(self.batches, predictions, residuals, strict=True):
                 if p.by_turn is None:
-                    after.append(r)
+                    adjusted.append(r)
                     continue
                 Q = by_turns(p, batch)
                 QT = Q.swapaxes(1, 2)
                 turned = -np.linalg.solve(QT @ Q + penalty * np.eye(TURNS), QT @ r.reshape(len(r), -1, 1))
-                after.append(r + (Q @ turned).reshape(r.shape))
-                given += float(np.sum(turned**2))
-            sigma = robust_sigma(self._seen(after))
-        return Evaluation(model, predictions, residuals, after, given, finite, sigma)
+                adjusted.append(r + (Q @ turned).reshape(r.shape))
+                squared_turns += float(np.sum(turned**2))
+            sigma = robust_sigma(self._seen(adjusted))
+        return Evaluation(model, predictions, residuals, adjusted, squared_turns, finite, sigma)
 
     def cost(self, here: Evaluation, scale: float) -> float:
         """Compute Huber's cost of the residuals plus the cost of jitter and prior [px^2]."""
         if not here.finite:
             return np.inf
-        cost = sum(huber_cost(r, scale) for r in here.after)
+        cost = sum(huber_cost(r, scale) for r in here.adjusted)
         variance = (scale / HUBER_SIGMAS) ** 2
         if self.jitter:
-            cost += variance / self.jitter**2 * here.given
+            cost += variance / self.jitter**2 * here.squared_turns
         if self.prior is not None:
             off, information = self._known(here.model, variance)
             cost += float(off @ (information * off))
@@ -486,7 +486,7 @@ class Problem:
                     Q = by_turns(p, batch)
                     QTQ = Q.swapaxes(1, 2) @ Q
                     parameters += float(np.trace(np.linalg.solve(QTQ + prior, QTQ), axis1=1, axis2=2).sum())
-        return coordinate_variance(self._seen(here.after), parameters)
+        return coordinate_variance(self._seen(here.adjusted), parameters)
 
     def equations(self, here: Evaluation, scale: float | None) -> Equations:
         """Form the normal equations with Huber's weights; with ``scale`` None, those of plain least squares."""
@@ -496,12 +496,12 @@ class Problem:
     def grams(self, here: Evaluation, scale: float | None) -> list[Gram]:
         """Compute J^T W J with J = (shared, board, turn, residual) for each view, batch by batch."""
         found = []
-        for batch, p, r, after in zip(self.batches, here.predictions, here.residuals, here.after, strict=True):
+        for batch, p, r, adjusted in zip(self.batches, here.predictions, here.residuals, here.adjusted, strict=True):
             turn = [p.by_turn] if p.by_turn is not None else []
             J = np.concatenate([p.by_shared, p.by_board, *turn, r[..., None]], axis=-1)
             J = masked(J, batch)
             if scale is not None:
-                J = J * np.sqrt(huber_weights(after, scale))[..., None, None]
+                J = J * np.sqrt(huber_weights(adjusted, scale))[..., None, None]
             J = J.reshape(len(J), -1, J.shape[-1])
             found.append((p.columns, J.swapaxes(1, 2) @ J))
         return found
@@ -672,7 +672,7 @@ class Fit:
     model: BundleModel
     free: tuple[Block, ...]  # blocks that were free
     residuals: Array  # predicted minus observed corners, (V, N, 2) [px]; nan for corners that are not seen
-    left: Array  # residuals after each view's pan and tilt are fitted within the jitter, (V, N, 2) [px]
+    adjusted: Array  # residuals after each view's pan and tilt are fitted within the jitter, (V, N, 2) [px]
     # normal matrix of the free blocks, with the boards' poses and any jitter eliminated; its inverse times
     # ``variance`` is the parameters' covariance
     normal: Array
@@ -726,13 +726,13 @@ def fit(
             break
     if not here.finite:
         raise CalibrationError("the corners cannot be explained by this rig: a board comes out behind a camera")
-    residuals, left = (np.full((len(views), len(points), 2), np.nan) for _ in range(2))
-    for batch, r, after in zip(problem.batches, here.residuals, here.after, strict=True):
+    residuals, adjusted = (np.full((len(views), len(points), 2), np.nan) for _ in range(2))
+    for batch, r, r_adjusted in zip(problem.batches, here.residuals, here.adjusted, strict=True):
         residuals[batch.rows] = np.where(batch.seen[..., None], r, np.nan)
-        left[batch.rows] = np.where(batch.seen[..., None], after, np.nan)
+        adjusted[batch.rows] = np.where(batch.seen[..., None], r_adjusted, np.nan)
     variance = problem.variance(here)
     normal = reduced(problem.equations(here, None), 0.0)[0]
-    return Fit(here.model, problem.free, residuals, left, normal, variance, jitter, tuple(views))
+    return Fit(here.model, problem.free, residuals, adjusted, normal, variance, jitter, tuple(views))
 
 
 def information(model: BundleModel, views: Sequence[View], points: Array, free: Collection[Block]) -> Array:

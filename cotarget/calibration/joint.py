@@ -466,8 +466,8 @@ def _without_wrong_heads(found: Fit, points: Array, prior: Prior) -> tuple[Fit, 
 def _without_wrong_corners(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:
     """Leave out corners with far too large residuals, and estimate the head's jitter; returns as `_cleaned`."""
     found = _with_jitter(found, points, prior)
-    lengths = np.linalg.norm(found.left, axis=-1)  # nan for corners that are not seen
-    limit = max(WRONG_SIGMAS * robust_sigma(found.left[np.isfinite(lengths)]), WRONG_FLOOR_PX)
+    lengths = np.linalg.norm(found.adjusted, axis=-1)  # nan for corners that are not seen
+    limit = max(WRONG_SIGMAS * robust_sigma(found.adjusted[np.isfinite(lengths)]), WRONG_FLOOR_PX)
     wrong = lengths > limit
     if not wrong.any():
         return found, 0, []

@@ -33,7 +33,7 @@ from cotarget.rig import Clock, Frame, Image, PanTiltState, Rig, ZoomCamera, Zoo
 log = logging.getLogger(__name__)
 # Requested poses are rounded to 0.1 mm and 0.1 mrad. The fits behind a plan sum in an order that varies with the
 # threads; unrounded, their last digits would make two runs with the same seed diverge.
-WISH_DECIMALS = 4
+POSE_DECIMALS = 4
 # Time after everything stands until an image counts [s], for vibrations and for an exposure that began before. The long
 # one is for real cameras, whose latency is not measured yet, so that frames may be dated too late.
 SETTLE, SETTLE_LONG = 0.05, 0.5
@@ -57,11 +57,12 @@ class CaptureRecorder:
     directory: Path | None = None  # folder for the captures; None to keep the corners only
     views: list[View] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)  # images in which a board was expected but not found
-    misses: list[tuple[Array, float]] = field(default_factory=list)  # boards that the fixed camera did not see
+    # middle [px], (2,), and depth [m] of each board that the fixed camera did not see
+    misses: list[tuple[Array, float]] = field(default_factory=list)
     number: int = -1  # number of the present placement
     _captures: list[Capture] = field(default_factory=list)
     _still_since: float = 0.0
-    _wish: tuple[float, float] | None = None
+    _goal: tuple[float, float] | None = None
 
     @property
     def points(self) -> Array:
@@ -105,13 +106,13 @@ class CaptureRecorder:
 
     def present(self, T_fixed_board: RigidTransform) -> None:
         """Request the board at a pose as a new placement."""
-        wish = RigidTransform.from_components(
-            np.round(T_fixed_board.translation, WISH_DECIMALS),
-            Rotation.from_rotvec(np.round(T_fixed_board.rotation.as_rotvec(), WISH_DECIMALS)),
+        requested = RigidTransform.from_components(
+            np.round(T_fixed_board.translation, POSE_DECIMALS),
+            Rotation.from_rotvec(np.round(T_fixed_board.rotation.as_rotvec(), POSE_DECIMALS)),
         )
         before = self._fixed_corners() if self.rig.board.patience else None
-        self._log(self.rig.clock.now(), "present", pose_dict(wish))
-        self.rig.board.present(wish)
+        self._log(self.rig.clock.now(), "present", pose_dict(requested))
+        self.rig.board.present(requested)
         if self.rig.board.patience:
             self._wait_until_held(before)
         self._settle(self.rig.clock.now())
@@ -143,19 +144,19 @@ class CaptureRecorder:
             CalibrationError: the head stands elsewhere than commanded.
             HaltedError: the head was halted each time.
         """
-        wish = self._wish = round(pan, WISH_DECIMALS), round(tilt, WISH_DECIMALS)
+        goal = self._goal = round(pan, POSE_DECIMALS), round(tilt, POSE_DECIMALS)
         for left in reversed(range(TRIES)):
             before = self.rig.head.state()
             begin = self.rig.clock.now()
             try:
-                wanted = self.rig.head.move(*wish, wait=True)
+                wanted = self.rig.head.move(*goal, wait=True)
             except HaltedError as error:
-                self._log(begin, "turn", wish)
+                self._log(begin, "turn", goal)
                 if not left:
                     raise
                 log.warning("%s; the head is sent again", error)
                 continue
-            self._log(begin, "turn", wish, wanted)
+            self._log(begin, "turn", goal, wanted)
             way = max(abs(wanted[0] - before.pan), abs(wanted[1] - before.tilt))
             state, arrived = wait_for_head(self.rig, wanted, way)
             if arrived:
@@ -187,8 +188,8 @@ class CaptureRecorder:
                 return look(self._still_since)
             except StaleFrameError as error:
                 log.warning("%s; looking again", error)
-            if self._wish is not None:
-                self.turn(*self._wish)
+            if self._goal is not None:
+                self.turn(*self._goal)
             self._wait_for(self.rig.clock.now())
         return look(self._still_since)
 

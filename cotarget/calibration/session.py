@@ -113,10 +113,10 @@ def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> BundleMo
     coverage = {"fixed": Coverage(size)}
     for k in range(LEARNING):
         model, shares, margin_px = BundleModel({}, FixedCamera(lens)), [preferred_share(k)], ROUGH_MARGIN * size[0]
-        wishes = plan_placements(model, board, coverage, shares, rng, shared=False, margin_px=margin_px)
-        if not wishes:
+        planned = plan_placements(model, board, coverage, shares, rng, shared=False, margin_px=margin_px)
+        if not planned:
             continue
-        recorder.present(wishes[0])
+        recorder.present(planned[0])
         if (view := recorder.see_fixed()) is not None:
             coverage["fixed"].add(view.corners_px)
         recorder.see_zoom(expected=False)
@@ -316,15 +316,15 @@ def see_stops(
             break
         share = FARTHEST_SHARE - (FARTHEST_SHARE - NEAREST_SHARE) * done / max(placements - 1, 1)
         coverage = {"fixed": recorder.coverage("fixed")}
-        wishes = plan_placements(
+        planned = plan_placements(
             only_fixed, recorder.board, coverage, [share], rng, shared=False, margin_px=BORDER_PX, accept=reachable
         )
-        if not wishes:
+        if not planned:
             continue
-        recorder.present(wishes[0])
+        recorder.present(planned[0])
         fixed_view = recorder.see_fixed()
         if fixed_view is None:
-            recorder.misses.append(where_in(model.fixed.lens, recorder.board, wishes[0]))
+            recorder.misses.append(where_in(model.fixed.lens, recorder.board, planned[0]))
             continue
         done += 1
         for i, stop in enumerate(stops[1:], start=2):
@@ -341,10 +341,10 @@ def see_stops(
     return model
 
 
-def _reachable(recorder: CaptureRecorder, model: BundleModel, wish: RigidTransform) -> bool:
-    """Check whether the head can point at every corner of a board at a pose T_fixed_board."""
+def _reachable(recorder: CaptureRecorder, model: BundleModel, T_fixed_board: RigidTransform) -> bool:
+    """Check whether the head can point at every corner of a board."""
     head, lens = model.head, model.head.lens.stops[0]
-    corners = (head.T_base_fixed * wish).apply(recorder.points)
+    corners = (head.T_base_fixed * T_fixed_board).apply(recorder.points)
     found = solve(corners, head.hand_eye(), head.axes, lens.ray(lens.image_center_px))
     return bool(recorder.rig.head.limits.allow(found.pan[:, 0], found.tilt[:, 0]).all())
 
@@ -511,8 +511,8 @@ def _cover(
         # After a miss the rough model's distortion is wrong near the border, so the next placement keeps farther away.
         margin = min((ROUGH_MARGIN if done < REFIT_ALWAYS else FINE_MARGIN) * MARGIN_GROWTH**misses, WIDEST_MARGIN)
         recorder.turn(0.0, 0.0)
-        wish = _next_placement(recorder, model, rng, margin, predicted)
-        recorder.present(wish)
+        requested = _next_placement(recorder, model, rng, margin, predicted)
+        recorder.present(requested)
         error = "" if predicted is None else f", predicted error {np.degrees(predicted.error()):.4f} degrees"
         report(f"board {recorder.number + 1} of {placements}{error}")
         missed = misses > 0
@@ -521,9 +521,9 @@ def _cover(
         if misses > MOST_MISSES:
             raise CalibrationError(f"the fixed camera lost the board: not seen {misses} times in a row")
         if fixed_view is None:
-            recorder.misses.append(where_in(model.fixed.lens, recorder.board, wish))
+            recorder.misses.append(where_in(model.fixed.lens, recorder.board, requested))
             continue
-        T = _see_from_everywhere(recorder, model, wish, fixed_view, margin, rng)
+        T = _see_from_everywhere(recorder, model, requested, fixed_view, margin, rng)
         done += 1
         if done <= REFIT_ALWAYS or done % REFIT_EVERY == 0 or missed:
             found = refitted(model, recorder)
@@ -550,20 +550,22 @@ def _next_placement(
     coverage = {"fixed": recorder.coverage("fixed"), "zoom": recorder.coverage("zoom")}
     margin_px = margin * model.fixed.size[0]
     shares = [preferred_share(recorder.number), *rng.uniform(size=CHOICES - 1)]
-    wishes = plan_placements(model, board, coverage, shares[: CHOICES // 2], rng, shared=True, margin_px=margin_px)
-    wishes += plan_placements(model, board, coverage, shares[len(wishes) :], rng, shared=False, margin_px=margin_px)
+    candidates = plan_placements(model, board, coverage, shares[: CHOICES // 2], rng, shared=True, margin_px=margin_px)
+    candidates += plan_placements(
+        model, board, coverage, shares[len(candidates) :], rng, shared=False, margin_px=margin_px
+    )
     best, least = None, (np.inf, np.inf)
-    for wish in wishes:
+    for candidate in candidates:
         zoom_margin_px = margin * model.head.lens.size[0]
-        turns = plan_poses(model, wish, board, coverage["zoom"], limits, MOVED_VIEWS, rng, zoom_margin_px)
-        if seen_at_home(model, wish, board):
+        turns = plan_poses(model, candidate, board, coverage["zoom"], limits, MOVED_VIEWS, rng, zoom_margin_px)
+        if seen_at_home(model, candidate, board):
             turns = [(0.0, 0.0), *turns]
         error = np.inf
         if predicted is not None and turns:
             views = planned_views(recorder.number + 1, turns, len(points))
-            error = predicted.error(predicted.worth(views, {recorder.number + 1: wish}, points))
+            error = predicted.error(predicted.worth(views, {recorder.number + 1: candidate}, points))
         if (error, -len(turns)) < least:
-            best, least = wish, (error, -len(turns))
+            best, least = candidate, (error, -len(turns))
     if best is None:
         raise CalibrationError("no placement of the board is visible to the fixed camera; use a smaller board")
     return best
@@ -572,7 +574,7 @@ def _next_placement(
 def _see_from_everywhere(
     recorder: CaptureRecorder,
     model: BundleModel,
-    wish: RigidTransform,
+    requested: RigidTransform,
     fixed_view: View,
     margin: float,
     rng: np.random.Generator,
@@ -581,7 +583,7 @@ def _see_from_everywhere(
     rig, board, coverage = recorder.rig, recorder.board, recorder.coverage("zoom")
     # Of the view's two possible poses, the one nearer to the requested rotation.
     poses = pose_candidates(model.fixed.lens, fixed_view.corners_px, recorder.points)
-    T = min(poses, key=lambda pose: float((pose.rotation * wish.rotation.inv()).magnitude()))
+    T = min(poses, key=lambda pose: float((pose.rotation * requested.rotation.inv()).magnitude()))
     home = seen_at_home(model, T, board)
     turns = plan_poses(
         model, T, board, coverage, rig.head.limits, MOVED_VIEWS + (not home), rng, margin * rig.zoom.size[0]

@@ -397,7 +397,7 @@ def _corners(calibration: Calibration, found: Fit, name: CameraName) -> Corners:
     seen = [found.views[i].seen for i in mine]
     size = calibration.fixed.size if name == "fixed" else calibration.zoom_head.lens.size
     at = [found.views[i].corners_px[s] for i, s in zip(mine, seen, strict=True)]
-    off = [found.left[i][s] for i, s in zip(mine, seen, strict=True)]
+    off = [found.adjusted[i][s] for i, s in zip(mine, seen, strict=True)]
     return Corners(size, np.concatenate([np.empty((0, 2)), *at]), np.concatenate([np.empty((0, 2)), *off]))
 
 
@@ -407,14 +407,14 @@ def _shape(found: Fit, points: Array) -> BoardShape:
     With residuals r = predicted - seen and their derivatives J by the corner's position, the offset is -J^+ r. With
     noise alone, r^T J J^+ r over the variance is a chi-square with three degrees of freedom.
     """
-    seen = np.isfinite(found.left[..., 0])
+    seen = np.isfinite(found.adjusted[..., 0])
     ends = [[predict_pixels(found.model, found.views, points + d) for d in (e, -e)] for e in POINT_STEP * np.eye(3)]
     J = np.stack([(plus - minus) / (2 * POINT_STEP) for plus, minus in ends], axis=-1)  # (views, N, 2, 3)
-    J, r = np.where(seen[..., None, None], J, 0.0), np.where(seen[..., None], found.left, 0.0)
+    J, r = np.where(seen[..., None, None], J, 0.0), np.where(seen[..., None], found.adjusted, 0.0)
     normal, gradient = np.einsum("vnki,vnkj->nij", J, J), np.einsum("vnki,vnk->ni", J, r)
     offsets, beyond = np.zeros((len(points), 3)), np.zeros(len(points), dtype=bool)
     enough = np.count_nonzero(seen, axis=0) >= FEWEST_IN_CELL
-    variance = robust_sigma(found.left[seen]) ** 2
+    variance = robust_sigma(found.adjusted[seen]) ** 2
     for i in np.flatnonzero(enough):
         offsets[i] = -np.linalg.pinv(normal[i]) @ gradient[i]
         beyond[i] = -offsets[i] @ gradient[i] > SHAPE_CHI2 * variance
