@@ -248,8 +248,10 @@ class CaptureRecorder:
 
 
 def _apart(a: Array, b: Array) -> float:
-    """Compute the mean distance between two sets of the same corners [px]."""
-    return float(np.mean(np.linalg.norm(a - b, axis=-1)))
+    """Compute the mean distance of the corners that both sets show [px]; infinite where there are none."""
+    off = np.linalg.norm(a - b, axis=-1)
+    shown = np.isfinite(off)
+    return float(np.mean(off[shown])) if shown.any() else np.inf
 
 
 # Waiting until head and lens stand
