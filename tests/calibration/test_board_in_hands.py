@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass, replace
 
+from cotarget.board import draw_board
 from cotarget.calibration.recorder import CaptureRecorder
+from cotarget.config import BoardConfig
 from cotarget.geometry import pose
-from tests.support.synthetic_rig import SyntheticRig
+from cotarget.rig import Frame
+from tests.support.synthetic_rig import PERIOD, SyntheticRig
 
 
 @dataclass
@@ -47,3 +50,19 @@ def test_session_stops_waiting_for_a_board_after_its_patience():
     recorder, begun = started(rig), rig.t
     recorder.present(pose([0, 0, -3.0], [0, 0, 0]))
     assert 5.0 <= rig.t - begun < 7.0
+
+
+def test_a_charuco_board_seen_in_part_counts_as_still():
+    board = BoardConfig("charuco", (8, 6), 0.1)
+    rig = SyntheticRig(board_config=board)
+    rig.board = replace(rig.board, patience=20.0)
+    before, after = (draw_board(board, 40)[:, left:] for left in (150, 170))  # without two columns of corners
+
+    def read(newer_than, timeout):
+        rig.t = max(rig.t, newer_than) + PERIOD
+        return Frame(before if len(rig.placed) == 1 else after, rig.t)
+
+    rig.fixed.read = read
+    recorder, begun = started(rig), rig.t
+    recorder.present(pose([0, 0, 2.0], [0, 0, 0]))
+    assert rig.t - begun < 2.0
