@@ -42,10 +42,10 @@ SAME_PUPIL = 1e-5  # [m]
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """A calibration from a dozen placements and three far ones, and the folder of its captures."""
+    """A calibration from a dozen placements and three far ones, the folder of its captures, and the rig afterwards."""
     directory = tmp_path_factory.mktemp("captures")
     rig, asked = SyntheticRig(optics=fourfold), {"placements": 12, "stops": STOPS, "far_placements": 3}
-    return calibrate(rig, BOARD, captures_dir=directory, options=QUICK, **asked), directory
+    return calibrate(rig, BOARD, captures_dir=directory, options=QUICK, **asked), directory, rig
 
 
 def at(calibration, nominal_px):
@@ -60,7 +60,8 @@ def at(calibration, nominal_px):
 
 
 def test_session_finds_every_zoom_sample(session):
-    calibration, _ = session
+    calibration, _, rig = session
+    assert (rig.focal_px, rig.pose) == (NOMINAL_PX, (0.0, 0.0))
     assert calibration.zoom_head.lens.nominal_px == pytest.approx(FOCAL_LENGTHS[::2])
     assert {view.focal_px for view in calibration.views if view.camera == "zoom"} == set(
         calibration.zoom_head.lens.nominal_px
@@ -72,7 +73,7 @@ def test_session_finds_every_zoom_sample(session):
 
 @pytest.mark.parametrize("nominal", FOCAL_LENGTHS, ids=lambda n: f"{n:.0f}px")
 def test_calibration_points_over_the_whole_focal_range(session, nominal):
-    calibration, _ = session
+    calibration, *_ = session
     stop = fourfold(nominal)
     found, true = at(calibration, nominal), zoomed(Truth(), stop)
     lens = found.zoom_head.lens.stops[0]
@@ -94,7 +95,7 @@ def rms(errors):
 
 @pytest.mark.slow
 def test_captures_in_any_order_give_the_same_calibration(session):
-    calibration, directory = session
+    calibration, directory, _ = session
     table = json.loads((directory / INDEX).read_text())
     np.random.default_rng(0).shuffle(table["captures"])
     (directory / INDEX).write_text(json.dumps(table))
