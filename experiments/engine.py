@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("experiments/calibration", "experiments/wire", "experiments/following", "experiments/paper", "benchmarks")
 PACKAGES = ("numpy", "scipy", "mujoco", "opencv-python-headless", "matplotlib", "gymnasium", "av")
-# Linear algebra, Mesa's renderer and the simulation read these when they start.
+# Linear algebra and Mesa's renderer read these when they start.
 LINEAR_ALGEBRA = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-ONE_THREAD = dict.fromkeys((*LINEAR_ALGEBRA, "LP_NUM_THREADS"), "1") | {"COTARGET_AHEAD": "0"}
+ONE_THREAD = dict.fromkeys((*LINEAR_ALGEBRA, "LP_NUM_THREADS"), "1")
 TALLY = "COTARGET_TALLY"  # file to which each rendered image adds a byte; see `cotarget.sim.render.opengl`
 ANSWER_S = 10.0  # timeout of the scheduler's answer [s]
 QUIET = logging.CRITICAL + 10  # Dask's log is silent, because each failure is reported in one line

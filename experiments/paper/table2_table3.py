@@ -164,83 +164,48 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
     """Format both tables in the paper's layout, then error and standard deviation of each parameter."""
+    head = "px, mm, degrees", "parameter", "true", "mean found", "error", "from", "to", "sigma", "/ sigma", "bias"
+    ratio, bias = summary["all"].values()
     return "\n\n".join(
         [
             f"Table 2: as the run of seed {settings.seed_base} has it, ± the standard deviation that it predicts\n"
             + _table_2(settings, summary),
             *(_matrices(words, summary[name], settings) for name, words in TRANSFORMS.items()),
             f"error of one run (rms over {settings.seeds} seeds) beside the standard deviation that it predicts\n"
-            + columns(
-                (
-                    "px, mm, degrees",
-                    "parameter",
-                    "true",
-                    "mean found",
-                    "error",
-                    "from",
-                    "to",
-                    "sigma",
-                    "/ sigma",
-                    "bias",
-                ),
-                _errors(summary),
-            ),
-            "bias: the mean error over sigma / sqrt(seeds); at most {:.2f} either way (wanted: <= {:g})".format(
-                summary["all"]["largest bias over its scatter"], BIASED
-            ),
-            "all parameters: error / sigma {:.2f} rms (wanted: {:g} to {:g})".format(
-                summary["all"]["error over sigma"], *HONEST
-            ),
+            + columns(head, _errors(summary)),
+            f"bias: the mean error over sigma / sqrt(seeds); at most {bias:.2f} either way (wanted: <= {BIASED:g})",
+            f"all parameters: error / sigma {ratio:.2f} rms (wanted: {HONEST[0]:g} to {HONEST[1]:g})",
         ]
     )
 
 
 def _table_2(settings: Settings, summary: Mapping[str, Any]) -> str:
-    """Format Table 2 for the paper's cameras, or for a user's own, whose manufacturer and CCD size are unknown."""
-    head = ("rows are [v, u]", "focal length, px", "mm", "centre, px", "CCD, mm", "pitch, mm")
-    if not settings.rig:
-        return columns(head, _lens(summary, CAMERAS, "  true, as printed", PITCH_MM, CCD_MM))
-    pitch_mm = {"zoom": settings.config("indoor", (), settings.seed_base).sim.zoom.pitch_mm}
-    return columns([words for words in head if words != "CCD, mm"], _lens(summary, CAMERA_WORDS, "  true", pitch_mm))
+    """Format Table 2, each camera's truth below the estimate; the CCD of a user's own camera is not known."""
+    head = ["rows are [v, u]", "focal length, px", "mm", "centre, px", "pitch, mm"]
+    names, truth, pitches_mm = CAMERAS, "  true, as printed", PITCH_MM
+    if settings.rig:
+        names, truth = CAMERA_WORDS, "  true"
+        pitches_mm = {"zoom": settings.config("indoor", (), settings.seed_base).sim.zoom.pitch_mm}
+    else:
+        head.insert(-1, "CCD, mm")
+    lines = []
+    for camera, name in names.items():
+        parameters, pitch_mm = summary[camera], pitches_mm.get(camera)
+        for title, key in ((name, "first"), (truth, "true")):
+            focal_mm = NOT_KNOWN if pitch_mm is None else _pair(parameters, LENS[:2], key, pitch_mm)
+            ccd_mm = [] if settings.rig else ["[{:.2f}, {:.2f}]".format(*CCD_MM[camera])]
+            pitch = NOT_KNOWN if pitch_mm is None else f"{pitch_mm:g}"
+            focal_px, center_px = (_pair(parameters, each, key) for each in (LENS[:2], LENS[2:]))
+            lines.append([title, focal_px, focal_mm, center_px, *ccd_mm, pitch])
+    return columns(head, lines)
 
 
-def _lens(
-    summary: Mapping[str, Any],
-    names: Mapping[str, str],
-    truth: str,
-    pitch_mm: Mapping[str, float],
-    ccd_mm: Mapping[str, tuple[float, float]] | None = None,
-) -> Iterator[list[str]]:
-    """Make the rows of Table 2, with each camera's truth below the estimate.
-
-    Args:
-        summary: the figures.
-        names: descriptions of the cameras.
-        truth: name of the true values; for the paper's cameras these are the printed ones.
-        pitch_mm: size of a pixel of the cameras for which it is known [mm].
-        ccd_mm: sizes of the CCDs, if there is a column for them [mm].
-    """
-    for camera in CAMERAS:
-        parameters, pitch = summary[camera], pitch_mm.get(camera)
-        for title, key in ((names[camera], "first"), (truth, "true")):
-            sigmas = {name: each["first_sigma"] if key == "first" else None for name, each in parameters.items()}
-            cells = {name: value_and_sigma(each[key], sigmas[name]) for name, each in parameters.items()}
-            focal_mm = NOT_KNOWN
-            if pitch is not None:
-                told = [
-                    value_and_sigma(parameters[name][key] * pitch, sigma and sigma * pitch)
-                    for name in LENS[:2]
-                    for sigma in [sigmas[name]]
-                ]
-                focal_mm = f"[{', '.join(told)}]"
-            yield [
-                title,
-                f"[{cells['fy']}, {cells['fx']}]",
-                focal_mm,
-                f"[{cells['cy']}, {cells['cx']}]",
-                *([] if ccd_mm is None else ["[{:.2f}, {:.2f}]".format(*ccd_mm[camera])]),
-                NOT_KNOWN if pitch is None else f"{pitch:g}",
-            ]
+def _pair(parameters: Mapping[str, Any], names: Sequence[str], key: str, unit: float = 1.0) -> str:
+    """Format two parameters, times a unit; the estimate ("first") with its standard deviation."""
+    cells = []
+    for each in (parameters[name] for name in names):
+        cells.append(value_and_sigma(each[key] * unit, each["first_sigma"] * unit if key == "first" else None))
+    return f"[{', '.join(cells)}]"
 
 
 def _matrices(words: str, parameters: Mapping[str, Any], settings: Settings) -> str:

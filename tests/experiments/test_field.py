@@ -16,9 +16,9 @@ from cotarget.pipeline import FollowSettings
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
-from experiments.following import dead_zone, delay, field, first_shot, five_targets, hold, shots
+from experiments.following import dead_zone, delay, field, first_shot, five_targets, hold
 from experiments.following.field_scenes import hold_config
-from experiments.following.shots import CAUSES, Shot, budget
+from experiments.following.first_shot import CAUSES, Shot, budget
 from experiments.following.wide_view import Seen, WideView, open_on, record
 from experiments.tables import spread
 from tests.support.rigs import with_zoom_head
@@ -301,8 +301,8 @@ def test_a_chance_passes_while_the_target_is_not_seen(exact, monkeypatch):
     config = hold_config("book", 1)
     with (world := SimWorld(config, rendered=())).rig:
         finder = Blinded(world.truth(), 1, TruthNoise(0.2, 0.01, 0.0))
-        monkeypatch.setattr(shots, "make_detector", lambda *_: finder)
-        monkeypatch.setattr(shots, "SimWorld", lambda config: SimWorld(config, rendered=()))
+        monkeypatch.setattr(first_shot, "make_detector", lambda *_: finder)
+        monkeypatch.setattr(first_shot, "SimWorld", lambda config: SimWorld(config, rendered=()))
         settings = first_shot.FirstShotSettings(targets=("book",), seconds=5.9, calibrated=False)
         rows = first_shot.one(settings, 1)
     assert [row["fired"] for row in rows] == [True, True, False, False]
