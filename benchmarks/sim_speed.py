@@ -90,7 +90,7 @@ class Stepper:
     """The loop's access to a rig, without detection."""
 
     def __init__(self, config: RigConfig) -> None:
-        self.world = SimWorld(config, ahead=False)  # its thread would render during other worlds' turns
+        self.world = SimWorld(config)
         rig = self.world.rig
         rig.zoom.zoom(ZOOMED * rig.zoom.focal_range[0])
         rig.clock.sleep_until(SETTLED_S)

@@ -102,7 +102,7 @@ def _calibrate(seed: int, work: Path, progress: Progress) -> dict[str, Any]:
     from cotarget.sim.world import SimWorld
 
     config = sim_config(CALIBRATION_SCENE, (), seed)
-    world = SimWorld(config, ahead=False)  # rendering ahead takes another 200 MB
+    world = SimWorld(config)
     with guard(world.rig, config.safety) as rig:
         calibration = calibrate(
             rig,
@@ -147,7 +147,7 @@ def _follow_one(name: str, seed: int, work: Path, progress: Progress) -> None:
     config = sim_config(SCENES[name], (name,), seed)
     target, rate_hz = config.target(name), config.sim.fixed.rate_hz
     calibration = load_calibration(work / CALIBRATION)
-    world = SimWorld(config, ahead=False)  # rendering ahead takes another 200 MB
+    world = SimWorld(config)
     truth = world.truth()
     rows: list[Row] = []
     with guard(world.rig, config.safety) as rig, FilmWriter(work / f"{name}.mp4", rate_hz) as film:

@@ -1,6 +1,5 @@
 """Poses of a compiled world at a time: head, targets, board and clutter, as functions of time alone."""
 
-import copy
 import math
 from collections.abc import Mapping
 
@@ -48,12 +47,6 @@ class WorldState:
         self._boards: list[tuple[float, RigidTransform | None, bool]] = [(-math.inf, None, False)]
         self._shown: tuple[float, float, float, int] | None = None
         self._cluttered = False
-
-    def apart(self, model: "mujoco.MjModel") -> "WorldState":
-        """Give the same world's state on a copy of its model, for another thread."""
-        other = copy.copy(self)
-        other._model, other._data, other._shown = model, mujoco.MjData(model), None
-        return other
 
     @property
     def faint(self) -> npt.NDArray[np.intp]:

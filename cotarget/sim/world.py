@@ -25,7 +25,7 @@ from cotarget.sim.model import build_model, has_clutter, mount_pose
 from cotarget.sim.render.optics import TrueLens, covering_size
 from cotarget.sim.render.pictures import Portrait, SizedPictures, portrait
 from cotarget.sim.render.sensor import Sensor
-from cotarget.sim.render.views import Ahead, Views, is_allowed
+from cotarget.sim.render.views import Views
 from cotarget.sim.state import WorldState
 from cotarget.sim.targets.target import Target, make_target, target_rng
 from cotarget.sim.truth import NO_DISTORTION, CameraName, Truth
@@ -53,7 +53,6 @@ class SimWorld:
         clock: Clock | None = None,
         *,
         rendered: Collection[CameraName] = CAMERAS,
-        ahead: bool = True,
     ) -> None:
         """Build and compile the world.
 
@@ -62,8 +61,6 @@ class SimWorld:
             clock: source of time; by default a simulated clock, which only blocking calls advance.
             rendered: cameras whose frames are rendered; the frames of others are black. Times, latencies, head, lens
                 and truth do not change. With none, no OpenGL is needed.
-            ahead: whether the zoom camera's next frame may be rendered on another thread before it is read. It changes
-                the speed only. COTARGET_AHEAD=0 in the environment forbids it.
 
         Raises:
             ConfigError: an unknown scene or target.
@@ -86,13 +83,13 @@ class SimWorld:
         self._opened: Views | None = None
         if self._rendered:
             self._views()
-        ahead = ahead and is_allowed() and "zoom" in self._rendered
-        self._ahead = Ahead(self._views().apart) if ahead else None
         self._black = {name: np.zeros((*self._camera(name).size[::-1], 3), dtype=np.uint8) for name in CAMERAS}
         self._sensors = {name: Sensor(self._camera(name), effects, (sim.seed, NOISE[name])) for name in self._rendered}
         spec = rig_spec(config)
         fixed = SimStream(sim.fixed, effects, self._clock, partial(self.expose, "fixed"))
-        zoom = SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, self.lens_drive, spec.zoom.delay_s)
+        zoom = SimZoomStream(
+            sim.zoom, effects, self._clock, partial(self.expose, "zoom"), self.lens_drive, spec.zoom.delay_s
+        )
         head = SimPanTilt(spec.head, self._clock, self.head_drive)
         board = SimBoard(self._place_board)
         self._of_world = (fixed, zoom, board)
@@ -152,8 +149,6 @@ class SimWorld:
 
     def close(self) -> None:
         """Release the renderers and the rig's access to the world; safe to call more than once."""
-        if self._ahead is not None:
-            self._ahead.close()
         if self._opened is not None:
             self._opened.close()
         # Breaks reference cycles that would keep the model's memory until a garbage collection.
@@ -194,26 +189,11 @@ class SimWorld:
 
     def expose(self, name: CameraName, index: int, t: float) -> Image:
         """Render the exposure around time t [s], up to now, and add the sensor's effects of frame number ``index``."""
-        return self._exposed(self._views(), name, index, t) if name in self._rendered else self._black[name]
-
-    def _exposed(self, views: Views, name: CameraName, index: int, t: float) -> Image:
-        seen = views.exposed(name, partial(self._lens_at, name), t, self._exposure(name))
+        if name not in self._rendered:
+            return self._black[name]
+        exposure = self._camera(name).exposure_s if self.config.sim.effects.blur else 0.0
+        seen = self._views().exposed(name, partial(self._lens_at, name), t, exposure)
         return self._sensors[name].expose(seen, index)
-
-    def _exposure(self, name: CameraName) -> float:
-        return self._camera(name).exposure_s if self.config.sim.effects.blur else 0.0
-
-    def _expose_zoom(self, index: int, t: float) -> Image:
-        """Give a zoom frame; start rendering the next one where its exposure is already over."""
-        if self._ahead is None:
-            return self.expose("zoom", index, t)
-        image = self._ahead.take(index)
-        if image is None:
-            image = self.expose("zoom", index, t)
-        after = (index + 1) / self.config.sim.zoom.rate_hz
-        if after + self._exposure("zoom") / 2 < self._clock.now():
-            self._ahead.begin(index + 1, lambda views: self._exposed(views, "zoom", index + 1, after))
-        return image
 
     def _warn_of_unseen_paths(self) -> None:
         """Say which given paths never lead through the fixed camera's view, as those in millimetres do not."""

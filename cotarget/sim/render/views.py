@@ -3,20 +3,10 @@
 An exposure is the mean of four renders, but only where something moves by more than a fraction of a pixel during it. If
 the camera turns or zooms, that is the whole image: four renders without multisampling, shifted by parts of a pixel, so
 that their mean is antialiased. If only a target moves, it is a window around the target. At rest it is one render.
-
-`Ahead` renders the next frame on another thread, with its own OpenGL context, before it is read. This is possible
-because commands act from now on only, and a frame is often already exposed when the one before it is read. The image
-does not depend on it. Measurements: docs/design-notes.md.
 """
 
-import copy
 import math
-import os
-import queue
-import threading
-import weakref
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 import cv2
@@ -119,11 +109,6 @@ class Views:
         self._groups = np.array(model.geom_group)
         self._shown = self._groups < BOARD_GROUP
         self._blurs = self._shown & ~np.isin(np.arange(model.ngeom), state.faint)
-
-    def apart(self) -> "Views":
-        """Open another renderer of the same world for the calling thread; the two share no mutable data."""
-        model = copy.copy(self._model)
-        return Views(model, self._state.apart(model), self._size, self._shadows, self._multisampling)
 
     def close(self) -> None:
         """Release OpenGL; safe to call more than once."""
@@ -301,98 +286,3 @@ def _as_if(view: Pinhole, lens: TrueLens, now: TrueLens) -> Pinhole:
 def _shifted(view: Pinhole, by_px: tuple[float, float]) -> Pinhole:
     """Shift the sampling points of a view by a part of a pixel."""
     return replace(view, center_px=(view.center_px[0] - by_px[0], view.center_px[1] - by_px[1]))
-
-
-# Rendering the next frame ahead on another thread
-
-Job = Callable[[Views], Image]
-Jobs = queue.SimpleQueue[tuple[Job, "Future[Image]"] | None]
-# Number of frames that must be read in sequence before the next one is rendered ahead. Opening another OpenGL context
-# takes as long as this saves in some 20 frames.
-READ_IN_TURN = 10
-# Environment variable; "0" forbids rendering ahead where every core has its own work, as with parallel runs.
-ALLOWED = "COTARGET_AHEAD"
-
-
-def is_allowed() -> bool:
-    """Check that the environment allows rendering on another thread."""
-    return os.environ.get(ALLOWED) != "0"
-
-
-class Ahead:
-    """Renders the next frame of a camera whose frames are read in sequence.
-
-    Args:
-        open_views: opens the renderer; called on the thread that uses and closes it.
-    """
-
-    def __init__(self, open_views: Callable[[], Views]) -> None:
-        self._open_views = open_views
-        self._jobs: Jobs = queue.SimpleQueue()
-        self._finish: Callable[[], object] | None = None
-        self._last, self._in_turn = -1, 0
-        self._begun: tuple[int, Future[Image]] | None = None
-
-    def take(self, index: int) -> Image | None:
-        """Wait for frame number ``index`` if it was started; None if it was not."""
-        self._in_turn = self._in_turn + 1 if index == self._last + 1 else 0
-        begun, self._begun, self._last = self._begun, None, index
-        return begun[1].result() if begun is not None and begun[0] == index else None
-
-    def begin(self, index: int, job: Job) -> None:
-        """Start rendering frame number ``index`` if it is expected to be read next.
-
-        Raises:
-            DeviceError: the machine cannot render.
-        """
-        if self._in_turn < READ_IN_TURN or index != self._last + 1:
-            return
-        if self._finish is None:
-            self._start()
-        future: Future[Image] = Future()
-        self._begun = index, future
-        self._jobs.put((job, future))
-
-    def close(self) -> None:
-        """Finish the started frame and release OpenGL; safe to call more than once."""
-        if self._finish is not None:
-            self._finish()
-        self._finish, self._in_turn, self._begun = None, 0, None
-
-    def _start(self) -> None:
-        """Open the renderer and wait for it; no other thread may render while an OpenGL context is being opened."""
-        opened: Future[None] = Future()
-        work = (self._jobs, self._open_views, opened)
-        thread = threading.Thread(target=_render, args=work, name="render ahead", daemon=True)
-        thread.start()
-        opened.result()
-        # Runs also without `close`, and at the interpreter's exit.
-        self._finish = weakref.finalize(self, _end, self._jobs, thread)
-
-
-def _render(jobs: Jobs, open_views: Callable[[], Views], opened: "Future[None]") -> None:
-    """Open a renderer, do jobs with it until the queue gives None, and close it."""
-    try:
-        views = open_views()
-    except Exception as error:
-        opened.set_exception(error)
-        return
-    opened.set_result(None)
-    del opened
-    while (work := jobs.get()) is not None:
-        _do(views, *work)
-        del work  # it references the world, which must be freed while the queue is empty
-    views.close()
-
-
-def _do(views: Views, job: Job, future: "Future[Image]") -> None:
-    try:
-        future.set_result(job(views))
-    except Exception as error:
-        future.set_exception(error)
-
-
-def _end(jobs: Jobs, thread: threading.Thread) -> None:
-    jobs.put(None)
-    if thread is not threading.current_thread():
-        thread.join()
