@@ -461,15 +461,6 @@ def _write_intrinsics(camera: Intrinsics) -> dict[str, Any]:
 
 
 def _write_view(view: View) -> dict[str, Any]:
-    return {
-        "camera": view.camera,
-        "board": view.board,
-        "pan": view.pan,
-        "tilt": view.tilt,
-        "focal_px": view.focal_px,
-        "t": view.t,
-        "source": view.source,
-        "corners_px": [
-            corner if seen else None for corner, seen in zip(view.corners_px.tolist(), view.seen, strict=True)
-        ],
-    }
+    corners = [corner if seen else None for corner, seen in zip(view.corners_px.tolist(), view.seen, strict=True)]
+    keys = ("camera", "board", "pan", "tilt", "focal_px", "t", "source")
+    return {key: getattr(view, key) for key in keys} | {"corners_px": corners}

@@ -24,7 +24,6 @@ import numpy.typing as npt
 from cotarget.calibration.observability import (
     PARALLEL_SHARE,
     SMALLEST_TURN,
-    HandMotions,
     Observability,
     judge_motions,
     spectrum,
@@ -411,7 +410,7 @@ def solve_hand_eye_from_motions(
     a, b = _together(A), _together(B)
     problem = motion_problem(a, b, len(A) if independent is None else independent)
     X = RigidTransform.concatenate([_start(a, b)])
-    return _solved(problem, X, HandMotions(a.rotation.as_rotvec(), a.translation), regularize)
+    return _solved(problem, X, a, None, regularize)
 
 
 def solve_hand_eye(
@@ -460,8 +459,7 @@ def solve_hand_eye(
     placed = hands * X * seen
     start = RigidTransform.concatenate([X, *(placed[np.flatnonzero(owners == k)].mean() for k in range(len(numbers)))])
     turns_base = (hands[j].rotation * hands[i].rotation.inv()).as_rotvec()
-    moved = HandMotions(A.rotation.as_rotvec(), A.translation, turns_base)
-    result = _solved(pose_problem(hands, seen, owners), start, moved, regularize)
+    result = _solved(pose_problem(hands, seen, owners), start, A, turns_base, regularize)
     return replace(result, boards=tuple(board * to_middle.inv() for board in result.boards))
 
 
@@ -476,10 +474,12 @@ def _together(transforms: Sequence[RigidTransform]) -> RigidTransform:
         ) from None
 
 
-def _solved(problem: HandEyeProblem, start: RigidTransform, moved: HandMotions, regularize: bool) -> HandEye:
+def _solved(
+    problem: HandEyeProblem, start: RigidTransform, moved: RigidTransform, turns_base: Array | None, regularize: bool
+) -> HandEye:
     """Fit a problem, judge what is determined, and refuse or regularize what is not."""
     found = fit_motions(problem, start)
-    verdict = judge_motions(found.normal, found.noise, moved)
+    verdict = judge_motions(found.normal, found.noise, moved, turns_base)
     if not verdict.determined:
         if not regularize:
             raise CalibrationError(f"hand-eye: {verdict.text}")

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from cotarget.errors import CalibrationError
-from cotarget.geometry import Array
+from cotarget.geometry import Array, RigidTransform
 
 # Limits of use of a rotation [rad] and a position [m]. A start that is wrong by that much still leads later fits to the
 # optimum.
@@ -73,16 +73,6 @@ class Observability:
     directions: Array  # undetermined directions (w, d) of the transform [rad] and [m], unit vectors, (k, 6)
 
 
-@dataclass(frozen=True, eq=False)
-class HandMotions:
-    """Motions of the hand, as the verdict describes them."""
-
-    turns: Array  # rotation vectors in the hand's frame [rad], (n, 3)
-    shifts: Array  # translations in the hand's frame [m], (n, 3)
-    # rotation vectors in the base's frame [rad], (n, 3); None where only motions are known
-    turns_base: Array | None = None
-
-
 def spectrum(normal: Array, noise: Array) -> tuple[Array, Array]:
     """Compute how well each direction of a transform is known, against the limits of use and noise.
 
@@ -97,8 +87,12 @@ def spectrum(normal: Array, noise: Array) -> tuple[Array, Array]:
     return np.asarray(values), np.asarray(vectors)
 
 
-def judge_motions(normal: Array, noise: Array, motions: HandMotions) -> Observability:
-    """Judge what motions determine of X in A X = X B; see `spectrum` for normal and noise."""
+def judge_motions(normal: Array, noise: Array, motions: RigidTransform, turns_base: Array | None) -> Observability:
+    """Judge what motions of the hand determine of X in A X = X B; see `spectrum` for normal and noise.
+
+    The motions are in the hand's frame, and their rotation vectors also in the base's [rad], (n, 3), where poses are
+    known.
+    """
     values, vectors = spectrum(normal, noise)
     basis = vectors[:, values < 1]
     if not basis.shape[1]:
@@ -108,7 +102,7 @@ def judge_motions(normal: Array, noise: Array, motions: HandMotions) -> Observab
             "(one standard deviation of the worst direction)"
         )
         return Observability(True, text, (), np.empty((0, 6)))
-    moved, axis, axis_name, advice = _how_it_moved(motions)
+    moved, axis, axis_name, advice = _how_it_moved(motions, turns_base)
     turns, shifts = _free_axes(basis)
     free = (*_along("position", "along", shifts, axis, axis_name), *_along("rotation", "about", turns, axis, axis_name))
     text = f"{moved}: the camera's {listed(free)} {'is' if len(free) == 1 else 'are'} free; {advice}"
@@ -253,9 +247,9 @@ def _name_hand(names: Sequence[str], basis: Array) -> tuple[str, list[str], list
     return "", words, [NEARER]
 
 
-def _how_it_moved(motions: HandMotions) -> tuple[str, Array | None, str, str]:
+def _how_it_moved(motions: RigidTransform, turns_base: Array | None) -> tuple[str, Array | None, str, str]:
     """Describe the hand's motions in words, by their axis (3,) where there is only one, its name, and what to add."""
-    turns, shifts = motions.turns, motions.shifts
+    turns, shifts = motions.rotation.as_rotvec(), motions.translation
     largest = float(np.linalg.norm(turns, axis=1).max())
     moves = float(np.linalg.norm(shifts, axis=1).max())
     if largest < SMALLEST_TURN and moves < SMALLEST_SHIFT:
@@ -272,7 +266,7 @@ def _how_it_moved(motions: HandMotions) -> tuple[str, Array | None, str, str]:
         return moved, None, "", "turn the hand further, about two axes, or measure more often"
     axis = Vt[0]
     if moves <= max(LONGEST_OFFSET * largest, SMALLEST_SHIFT):
-        base = axis if motions.turns_base is None else np.linalg.svd(motions.turns_base, full_matrices=False)[2][0]
+        base = axis if turns_base is None else np.linalg.svd(turns_base, full_matrices=False)[2][0]
         if abs(base[1]) > ALIGNED:
             return "only pan moved", axis, "the pan axis", "add tilt"
         if abs(axis[0]) > ALIGNED:

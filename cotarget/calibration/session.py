@@ -61,6 +61,7 @@ from cotarget.parallel import Progress
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 
 log = logging.getLogger(__name__)
+
 # From the first board to a rough model of the rig
 
 FIRST_FIELD = np.radians(50.0)  # field of view assumed before the first board is seen

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from cotarget import __version__
-from cotarget.calibration import calibrate_captures
 from cotarget.calibration.calibrate import calibrate
 from cotarget.calibration.captures import INDEX, read_index
 from cotarget.calibration.planning import GRID, Coverage
@@ -66,19 +65,6 @@ def test_progress_counts_up_to_its_total(session):
     assert all(b[0] >= a[0] for a, b in itertools.pairwise(told))
 
 
-@pytest.mark.slow
-def test_captures_give_the_same_calibration(session):
-    _, calibration, directory, _ = session
-    again = calibrate_captures(directory)
-    error = again.zoom_head.T_zoom0_fixed.inv() * calibration.zoom_head.T_zoom0_fixed
-    # The very same images; only boards that a quick look had missed may be found now.
-    assert error.rotation.magnitude() < 1e-4
-    assert np.linalg.norm(error.translation) < 1e-3
-    assert abs(again.residuals.zoom_views - calibration.residuals.zoom_views) <= 3
-    with pytest.raises(CalibrationError, match="already holds captures"):
-        calibrate(SyntheticRig(), BOARD, captures_dir=directory)
-
-
 def test_index_lists_every_image_at_once(tmp_path):
     """Also those of the placement that is under way: in the zoom stage one of them holds many."""
     recorder = CaptureRecorder(SyntheticRig(), BOARD, tmp_path)
@@ -90,6 +76,8 @@ def test_index_lists_every_image_at_once(tmp_path):
             path.name for path in tmp_path.glob("*.png")
         )
         assert len(read_index(tmp_path).captures) == count
+    with pytest.raises(CalibrationError, match="already holds captures"):
+        CaptureRecorder(SyntheticRig(), BOARD, tmp_path).start()
 
 
 def test_session_writes_its_config_and_commands(tmp_path):
