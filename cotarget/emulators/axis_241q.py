@@ -24,24 +24,17 @@ from typing import Literal
 from urllib.parse import parse_qsl, urlsplit
 from urllib.request import parse_http_list, parse_keqv_list
 
-import cv2
 import numpy as np
 
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, Picture, encode_jpeg
 from cotarget.emulators.serve import LOCAL, TcpServer
-from cotarget.rig import Image
 
 # Requests and replies
 
 
 class HttpError(Exception):
-    """A request that is refused with an HTTP status.
-
-    Attributes:
-        status: of the reply.
-        headers: further header lines of the reply.
-    """
+    """A request is refused with an HTTP status and further header lines."""
 
     def __init__(self, status: HTTPStatus, *headers: str) -> None:
         super().__init__(status.phrase)
@@ -70,81 +63,52 @@ def error_reply(error: HttpError) -> bytes:
 # Authentication: basic and digest of RFC 2617 with qop=auth
 
 Scheme = Literal["digest", "basic"]
-NONCE_LIFE_S = 300.0  # an older nonce gets a new one and "stale"
 
 
 def _md5(*words: str) -> str:
     return hashlib.md5(":".join(words).encode(), usedforsecurity=False).hexdigest()
 
 
+@dataclass(frozen=True)
 class Authenticator:
-    """Check the authorization of requests; safe to use from any thread.
+    """Check the authorization of requests."""
 
-    Args:
-        user: user name; empty if everyone may connect.
-        password: of that user.
-        scheme: of authentication.
-        realm: in the challenge to the client.
-        now: returns the time [s].
-    """
+    user: str  # empty if everyone may connect
+    password: str
+    scheme: Scheme
+    realm: str
+    nonce: str  # of digest authentication; it never expires
 
-    def __init__(
-        self, user: str, password: str, scheme: Scheme, realm: str, now: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._user, self._password, self._scheme, self._realm, self._now = user, password, scheme, realm, now
-        self._issued: dict[str, float] = {}
-        self._used: set[tuple[str, str]] = set()
+    @property
+    def challenge(self) -> str:
+        """Header line that demands authentication."""
+        if self.scheme == "basic":
+            return f'WWW-Authenticate: Basic realm="{self.realm}"'
+        return f'WWW-Authenticate: Digest realm="{self.realm}", nonce="{self.nonce}", algorithm=MD5, qop="auth"'
 
-    def refuse(self, method: str, target: str, headers: Message) -> str | None:
-        """Return the challenge that refuses a request; None if it is allowed.
-
-        Args:
-            method: of the request, such as "GET".
-            target: as in the request line, with the arguments.
-            headers: of the request.
-        """
-        if not self._user:
-            return None
+    def allows(self, method: str, target: str, headers: Message) -> bool:
+        """Return whether a request is allowed; ``target`` is as in the request line, with the arguments."""
+        if not self.user:
+            return True
         scheme, _, rest = headers.get("Authorization", "").partition(" ")
-        if scheme.lower() != self._scheme:
-            return self.challenge()
-        if self._scheme == "basic":
-            wanted = base64.b64encode(f"{self._user}:{self._password}".encode()).decode()
-            return None if rest.strip() == wanted else self.challenge()
+        if scheme.lower() != self.scheme:
+            return False
+        if self.scheme == "basic":
+            return rest.strip() == base64.b64encode(f"{self.user}:{self.password}".encode()).decode()
         try:
             fields = parse_keqv_list(parse_http_list(rest))
         except (ValueError, IndexError):
-            return self.challenge()
-        if not self._digest(method, target, fields):
-            return self.challenge()
-        return None if self._fresh(fields["nonce"], fields["nc"]) else self.challenge(stale=True)
-
-    def challenge(self, stale: bool = False) -> str:
-        """Make the header line that demands authentication; ``stale`` if only the client's nonce is too old."""
-        if self._scheme == "basic":
-            return f'WWW-Authenticate: Basic realm="{self._realm}"'
-        nonce = secrets.token_hex(16)
-        self._issued[nonce] = self._now()
-        tail = ", stale=true" if stale else ""
-        return f'WWW-Authenticate: Digest realm="{self._realm}", nonce="{nonce}", algorithm=MD5, qop="auth"{tail}'
-
-    def _digest(self, method: str, target: str, fields: Mapping[str, str]) -> bool:
+            return False
         names = ("username", "realm", "uri", "qop", "nonce", "nc", "cnonce", "response")
         user, realm, uri, qop, nonce, count, cnonce, response = (fields.get(name, "") for name in names)
-        if (user, realm, uri, qop) != (self._user, self._realm, target, "auth") or len(count) != 8 or not cnonce:
+        if (user, realm, uri, qop, nonce) != (self.user, self.realm, target, "auth", self.nonce):
             return False
         # RFC 2617, 3.2.2.1
-        secret = _md5(user, realm, self._password)
+        secret = _md5(user, realm, self.password)
         return response == _md5(secret, nonce, count, cnonce, qop, _md5(method, uri))
 
-    def _fresh(self, nonce: str, count: str) -> bool:
-        # The nonce must be this server's, not too old, and new with this count: a recorded request cannot be replayed.
-        known = self._now() - self._issued.get(nonce, -math.inf) <= NONCE_LIFE_S and (nonce, count) not in self._used
-        self._used.add((nonce, count))
-        return known
 
-
-# Images: requested by VAPIX arguments, scaled, and encoded once for all viewers
+# Images: requested by VAPIX arguments, scaled and encoded
 
 Size = tuple[int, int]
 INPUTS = (1, 2, 3, 4)  # one without a feed has no video
@@ -162,34 +126,23 @@ SMALLEST_SIDE, LARGEST_SIZE = 16, (768, 576)
 # and to 100. The ARTPEC chip's own scale is not documented.
 DEFAULT_COMPRESSION = 30
 FINEST_QUALITY, COARSEST_QUALITY = 100, 10
-NO_VIDEO_COLOUR = (160, 40, 20)  # of the image of an input without a signal (BGR)
+# Image of an input without a signal (BGR).
+BLANK = np.full((SIZES["4CIF"][1], SIZES["4CIF"][0], 3), (160, 40, 20), np.uint8)
 
 
 @dataclass(frozen=True)
-class Order:
-    """A client's request for images.
+class ImageOptions:
+    """What a client requests."""
 
-    Attributes:
-        camera: number of the input.
-        size: (width, height) [px]; None for the camera's own.
-        compression: 0 to 100, less is finer.
-        rate_hz: highest frame rate; 0 for no limit.
-        count: number of images in the stream; 0 for no end.
-    """
-
-    camera: int
-    size: Size | None
-    compression: int
-    rate_hz: float
-    count: int
+    camera: int  # number of the input
+    size: Size | None  # (width, height) [px]; None for the camera's own
+    compression: int  # 0 to 100, less is finer
+    rate_hz: float  # highest frame rate; 0 for no limit
+    count: int  # number of images in a stream; 0 for no end
 
 
-def parse_order(arguments: Mapping[str, str], camera: str | None = None) -> Order:
-    """Parse VAPIX's arguments for images; unknown ones are ignored, as by the server.
-
-    Args:
-        arguments: of the request.
-        camera: camera in the path, if there is one.
+def parse_options(arguments: Mapping[str, str], camera: str | None = None) -> ImageOptions:
+    """Parse VAPIX's arguments for images, and a camera in the path; unknown arguments are ignored.
 
     Raises:
         HttpError: a value is invalid (400).
@@ -198,7 +151,7 @@ def parse_order(arguments: Mapping[str, str], camera: str | None = None) -> Orde
     if which not in map(str, INPUTS):
         raise HttpError(HTTPStatus.BAD_REQUEST)
     rates = [_number(arguments, name, 1000) for name in ("fps", "req_fps", "des_fps")]
-    return Order(
+    return ImageOptions(
         camera=int(which),
         size=_size(arguments.get("resolution", "")),
         compression=int(_number(arguments, "compression", 100, DEFAULT_COMPRESSION)),
@@ -227,11 +180,7 @@ def _size(text: str) -> Size | None:
 
 
 class Pace:
-    """Limiter of the frame rate that delays no image.
-
-    Args:
-        rate_hz: images a second; 0 for no limit.
-    """
+    """Limiter of the frame rate that delays no image; a rate of 0 is no limit."""
 
     # An image may come this part of a period early, so that jitter loses none of a source at exactly this rate.
     EARLY = 0.25
@@ -249,48 +198,32 @@ class Pace:
         return True
 
 
-class _Variant:
-    """The newest JPEG of one camera at one size and compression."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.index = -1
-        self.data = b""
-
-
 class Pictures:
-    """The server's inputs, and their newest JPEG of every requested size; safe to use from any thread.
-
-    Args:
-        feeds: by the number of the input.
-        quality: of JPEG, 0 to 100, at Axis' default compression.
-        faults: of the server.
-    """
+    """The server's inputs, and their images as JPEG; safe to use from any thread."""
 
     def __init__(self, feeds: Mapping[int, Feed], quality: int, faults: Faults) -> None:
         self._feeds, self._quality, self._faults = dict(feeds), quality, faults
-        self._variants: dict[tuple[int, Size, int, bool], _Variant] = {}
-        self._lock = threading.Lock()
+        self._shown: dict[int, Picture] = {}  # by the number of the input; repeated by the fault frozen
 
     def video(self, camera: int) -> bool:
         """Return whether an input has a signal."""
         return camera in self._feeds and "no-video" not in self._faults
 
-    def wait(self, order: Order, after: int, timeout: float) -> Picture | None:
+    def wait(self, options: ImageOptions, after: int, timeout: float) -> Picture | None:
         """Wait for the newest image above an index, unscaled; None if none comes within ``timeout`` [s].
 
         Raises:
             HttpError: the camera cannot give the requested size (400).
         """
-        if order.camera in self._feeds:
-            picture = self._feeds[order.camera].newest(after, timeout)
+        if options.camera in self._feeds:
+            picture = self._feeds[options.camera].newest(after, timeout)
         else:
             if after >= 0:
                 time.sleep(timeout)  # an input without a signal also has a frame rate
-            picture = Picture(blank_picture(SIZES["4CIF"]), after + 1, time.monotonic())
-        if picture is not None and order.size is not None:
+            picture = Picture(BLANK, after + 1, time.monotonic())
+        if picture is not None and options.size is not None:
             largest = np.maximum(picture.image.shape[1::-1], LARGEST_SIZE)
-            if min(order.size) < SMALLEST_SIDE or (order.size > largest).any():
+            if min(options.size) < SMALLEST_SIDE or (options.size > largest).any():
                 raise HttpError(HTTPStatus.BAD_REQUEST)
         return picture
 
@@ -300,31 +233,17 @@ class Pictures:
         size = SIZES["4CIF"] if picture is None else picture.image.shape[1::-1]
         return next((name for name, known in SIZES.items() if known == size), f"{size[0]}x{size[1]}")
 
-    def jpeg(self, order: Order, picture: Picture) -> tuple[int, bytes]:
-        """Encode an image, or take a newer one that another viewer's thread has encoded; return its index and JPEG."""
-        size = order.size or (picture.image.shape[1], picture.image.shape[0])
+    def jpeg(self, options: ImageOptions, picture: Picture) -> bytes:
+        """Encode an image as requested."""
+        if "frozen" in self._faults:
+            picture = self._shown.setdefault(options.camera, picture)
+        self._shown[options.camera] = picture
+        width, height = options.size or picture.image.shape[1::-1]
         if "resolution" in self._faults:
-            size = size[0] // 2, size[1] // 2
-        blank = "no-video" in self._faults
-        with self._lock:
-            variant = self._variants.setdefault((order.camera, size, order.compression, blank), _Variant())
-        with variant.lock:
-            if variant.index < picture.index and not (variant.data and "frozen" in self._faults):
-                image, quality = blank_picture(size) if blank else picture.image, self._jpeg_quality(order.compression)
-                variant.index, variant.data = picture.index, encode_jpeg(image, quality, size)
-            return variant.index, variant.data
-
-    def _jpeg_quality(self, compression: int) -> int:
+            width, height = width // 2, height // 2
         qualities = (FINEST_QUALITY, self._quality, COARSEST_QUALITY)
-        return round(float(np.interp(compression, (0, DEFAULT_COMPRESSION, 100), qualities)))
-
-
-def blank_picture(size: Size) -> Image:
-    """Make the image of an input without a signal."""
-    image = np.full((size[1], size[0], 3), NO_VIDEO_COLOUR, np.uint8)
-    scale = size[0] / 400
-    cv2.putText(image, "No video", (size[0] // 10, size[1] // 2), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255))
-    return image
+        quality = round(float(np.interp(options.compression, (0, DEFAULT_COMPRESSION, 100), qualities)))
+        return encode_jpeg(BLANK if "no-video" in self._faults else picture.image, quality, (width, height))
 
 
 def damaged(data: bytes, index: int) -> bytes:
@@ -342,11 +261,7 @@ SERIAL = "00408C000241"  # the unit's MAC address
 
 
 def parameters(sizes: Iterable[str]) -> dict[str, str]:
-    """Make the parameters that `param.cgi` lists, in its order.
-
-    Args:
-        sizes: of each input, for a client that requests no size.
-    """
+    """Make the parameters that known clients read, in the order of `param.cgi`, from the inputs' sizes."""
     listed = {
         "Brand.Brand": "AXIS",
         "Brand.ProdFullName": "AXIS 241Q Video Server",
@@ -354,26 +269,16 @@ def parameters(sizes: Iterable[str]) -> dict[str, str]:
         "Brand.ProdShortName": "AXIS 241Q",
         "Brand.ProdType": "Video Server",
         "Brand.WebURL": "http://www.axis.com",
-        "Image.NbrOfConfigs": str(len(INPUTS)),
     }
     for i, size in enumerate(sizes):
         listed |= {
             f"Image.I{i}.Name": f"Video {i + 1}",
-            f"Image.I{i}.Source": str(i),
             f"Image.I{i}.Appearance.Resolution": size,
             f"Image.I{i}.Appearance.Compression": str(DEFAULT_COMPRESSION),
-            f"Image.I{i}.Appearance.ColorEnabled": "yes",
-            f"Image.I{i}.Appearance.MirrorEnabled": "no",
-            f"Image.I{i}.Appearance.Rotation": "0",
-            f"Image.I{i}.Stream.Duration": "0",
-            f"Image.I{i}.Stream.FPS": "0",
             f"Image.I{i}.Stream.NbrOfFrames": "0",
         }
-    listed["ImageSource.NbrOfSources"] = str(len(INPUTS))
-    for i in range(len(INPUTS)):
-        listed |= {f"ImageSource.I{i}.Name": f"Video {i + 1}", f"ImageSource.I{i}.Video.DetectedType": "PAL"}
     listed |= {
-        "Properties.API.HTTP.AdminPath": "/operator/basic.shtml",
+        "ImageSource.NbrOfSources": str(len(INPUTS)),
         "Properties.API.HTTP.Version": "2",
         "Properties.Firmware.BuildDate": "Jan 01 2009 12:00",
         "Properties.Firmware.BuildNumber": "1",
@@ -421,8 +326,8 @@ AXIS_FAULTS = (
     "dashed-boundary",  # the boundary in a stream's header has the leading dashes
     "unauthorized",  # 401 for any password
     "busy",  # 503
-    "no-video",  # the inputs have no signal, and their images show that
-    "frozen",  # the same JPEG is repeated
+    "no-video",  # the inputs have no signal, and their images have one colour
+    "frozen",  # the same image is repeated
     "resolution",  # half the requested size
     "refuse",  # connections are closed at once
 )
@@ -431,9 +336,9 @@ REFUSING = ("unauthorized", "busy", "refuse")
 BOUNDARY = "--myboundary"
 VIEWERS = 20  # largest number of streams
 BODY_BYTES = 65536  # largest body of a request
-PATIENCE_S = 30.0  # time limit for a client to send its request, or to receive an image [s]
+CLIENT_TIMEOUT_S = 30.0  # time limit for a client to send its request, or to receive an image [s]
 FIRST_PICTURE_S = 2.0  # time limit for a camera's first image [s]
-LOOK_S = 0.1  # period with which a waiting sender checks whether the server closes or the client is gone [s]
+CHECK_S = 0.1  # period with which a waiting sender checks whether the server closes or the client is gone [s]
 LENGTH_ERROR = 777  # of a wrong Content-Length [bytes]
 # Limits of the wait for a refused client to close: time [s] and number of reads.
 DRAIN_S, DRAIN_READS = 1.0, 64
@@ -484,9 +389,9 @@ class AxisServer(TcpServer):
     ) -> None:
         self.faults = Faults(AXIS_FAULTS) if faults is None else faults
         self.pictures = Pictures(feeds, quality, self.faults)
-        self.guard = Authenticator(user, password, auth, f"AXIS_{SERIAL}")
+        self.guard = Authenticator(user, password, auth, f"AXIS_{SERIAL}", secrets.token_hex(16))
         self.note_sent, self.more = sent, dict(more or {})
-        self.seats = threading.BoundedSemaphore(VIEWERS)
+        self.places = threading.BoundedSemaphore(VIEWERS)
         super().__init__(self._serve_request, host, port)
 
     @property
@@ -498,17 +403,12 @@ class AxisServer(TcpServer):
         if "refuse" in self.faults:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             return
-        connection.settimeout(PATIENCE_S)
+        connection.settimeout(CLIENT_TIMEOUT_S)
         Request(connection, self)
 
 
 class Request(BaseHTTPRequestHandler):
-    """One request, parsed and answered on construction.
-
-    Args:
-        connection: to the client.
-        device: the server.
-    """
+    """One request, parsed and answered on construction."""
 
     default_request_version = "HTTP/1.0"  # of a request line without one
 
@@ -554,11 +454,8 @@ class Request(BaseHTTPRequestHandler):
             HttpError: it is refused.
         """
         device = self.device
-        challenge = device.guard.refuse(self.command, self.path, self.headers)
-        if "unauthorized" in self.faults:
-            challenge = device.guard.challenge()
-        if challenge is not None:
-            raise HttpError(HTTPStatus.UNAUTHORIZED, challenge)
+        if "unauthorized" in self.faults or not device.guard.allows(self.command, self.path, self.headers):
+            raise HttpError(HTTPStatus.UNAUTHORIZED, device.guard.challenge)
         if "busy" in self.faults:
             raise HttpError(HTTPStatus.SERVICE_UNAVAILABLE)
         if self.command not in ("GET", "POST"):
@@ -573,12 +470,12 @@ class Request(BaseHTTPRequestHandler):
                 self.connection.sendall(text_reply(video_status(device.pictures.video, arguments)))
             case "snapshot" | "stream":
                 assert match is not None
-                order = parse_order(arguments, match["camera"])
-                (self._snapshot if kind == "snapshot" else self._stream)(order)
+                options = parse_options(arguments, match["camera"])
+                (self._snapshot if kind == "snapshot" else self._stream)(options)
             case _:
                 raise HttpError(HTTPStatus.NOT_FOUND)
 
-    def _first(self, order: Order) -> Picture:
+    def _first(self, options: ImageOptions) -> Picture:
         """Wait for the newest image of a camera.
 
         Raises:
@@ -586,57 +483,56 @@ class Request(BaseHTTPRequestHandler):
         """
         deadline = time.monotonic() + FIRST_PICTURE_S
         while not self.device.closing.is_set() and time.monotonic() < deadline:
-            if picture := self.device.pictures.wait(order, -1, LOOK_S):
+            if picture := self.device.pictures.wait(options, -1, CHECK_S):
                 return picture
         raise HttpError(HTTPStatus.SERVICE_UNAVAILABLE)
 
-    def _snapshot(self, order: Order) -> None:
-        headers, data = self._spoil(*self.device.pictures.jpeg(order, self._first(order)))
+    def _snapshot(self, options: ImageOptions) -> None:
+        picture = self._first(options)
+        headers, data = self._with_faults(picture.index, self.device.pictures.jpeg(options, picture))
         self._send(reply_head(HTTPStatus.OK, headers), data, b"")
 
-    def _stream(self, order: Order) -> None:
+    def _stream(self, options: ImageOptions) -> None:
         """Send images, always the newest next, until the request is fulfilled or the client is gone.
 
         Raises:
             HttpError: all places for viewers are taken, or there is no image (503).
         """
-        if not self.device.seats.acquire(blocking=False):
+        if not self.device.places.acquire(blocking=False):
             raise HttpError(HTTPStatus.SERVICE_UNAVAILABLE)
         try:
-            self._first(order)
+            self._first(options)
             dashes = "--" if "dashed-boundary" in self.faults else ""
             kind = f"Content-Type: multipart/x-mixed-replace;boundary={dashes}{BOUNDARY[2:]}"
             self.connection.sendall(reply_head(HTTPStatus.OK, [kind]))
-            for sent, (index, data) in enumerate(self._newest(order), 1):
-                if not self._part(index, data) or sent == order.count:
+            for sent, (index, data) in enumerate(self._newest(options), 1):
+                if not self._part(index, data) or sent == options.count:
                     return
         finally:
-            self.device.seats.release()
+            self.device.places.release()
 
-    def _newest(self, order: Order) -> Iterator[tuple[int, bytes]]:
+    def _newest(self, options: ImageOptions) -> Iterator[tuple[int, bytes]]:
         """Yield index and JPEG of the newest image, each once, at the requested rate, until the stream ends."""
-        pace, last = Pace(order.rate_hz), -1
-        while self._goes_on():
-            picture = self.device.pictures.wait(order, last, LOOK_S)
+        pace, last = Pace(options.rate_hz), -1
+        while self._is_open():
+            picture = self.device.pictures.wait(options, last, CHECK_S)
             if picture is None:
-                if self._gone():
+                if self._client_is_gone():
                     return
                 continue
             last = picture.index
             if pace.due(time.monotonic()):
-                index, data = self.device.pictures.jpeg(order, picture)
-                last = max(last, index)
-                yield index, data
+                yield picture.index, self.device.pictures.jpeg(options, picture)
 
-    def _goes_on(self) -> bool:
+    def _is_open(self) -> bool:
         return not self.device.closing.is_set() and not any(name in self.faults for name in REFUSING)
 
     def _part(self, index: int, data: bytes) -> bool:
-        headers, data = self._spoil(index, data)
+        headers, data = self._with_faults(index, data)
         self.device.note_sent(index, time.monotonic())
         return self._send("\r\n".join([BOUNDARY, *headers, "", ""]).encode(), data, b"\r\n")
 
-    def _spoil(self, index: int, data: bytes) -> tuple[list[str], bytes]:
+    def _with_faults(self, index: int, data: bytes) -> tuple[list[str], bytes]:
         """Make the headers and bytes of an image, with the faults that are on."""
         length = len(data)
         if "wrong-length" in self.faults:  # in turn too long and too short
@@ -654,14 +550,14 @@ class Request(BaseHTTPRequestHandler):
             return False
         if "stall" in self.faults:
             self.connection.sendall(whole[:middle])
-            while not self.faults.wait_while("stall", LOOK_S):
-                if not self._goes_on() or "cut" in self.faults or self._gone():
+            while not self.faults.wait_while("stall", CHECK_S):
+                if not self._is_open() or "cut" in self.faults or self._client_is_gone():
                     return False
             whole = whole[middle:]
         self.connection.sendall(whole)
         return True
 
-    def _gone(self) -> bool:
+    def _client_is_gone(self) -> bool:
         """Return whether the client has closed its side; a viewer sends nothing."""
         readable, _, _ = select.select([self.connection], [], [], 0)
         return bool(readable) and not self.connection.recv(1, socket.MSG_PEEK)

@@ -29,23 +29,23 @@ from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, LensPlant, encode_jpeg
 from cotarget.emulators.ptpip import (
     ARRAY,
+    JPEG,
     LINE_FAULTS,
     STRING,
     UINT8,
     UINT16,
     UINT32,
     Code,
-    DeviceInfo,
-    ObjectInfo,
     Property,
     PtpError,
     PtpIpServer,
     PtpReply,
-    Range,
     Value,
     array,
     decode,
+    device_info,
     encode,
+    object_info,
     storage_info,
 )
 from cotarget.emulators.serve import LOCAL
@@ -57,7 +57,7 @@ log = logging.getLogger(__name__)
 # Viewfinder and stills
 
 PICTURE_WAIT_S = 1.0  # time limit for the viewfinder's next image [s]
-SLICE_S = 0.1  # period of checking whether the viewfinder is still on [s]
+CHECK_S = 0.1  # period of checking whether the viewfinder is still on [s]
 
 
 @dataclass(frozen=True)
@@ -69,13 +69,7 @@ class Exposure:
 
 
 class Viewfinder:
-    """Scaled images of a feed as JPEG, each given once.
-
-    Args:
-        feed: of images.
-        size: (width, height) of the viewfinder [px].
-        quality: of JPEG, 1 to 100.
-    """
+    """Images of a feed as JPEG of one size (width, height) [px], each given once."""
 
     def __init__(self, feed: Feed, size: tuple[int, int], quality: int) -> None:
         self._feed, self._size, self._quality = feed, size, quality
@@ -95,7 +89,7 @@ class Viewfinder:
         """Wait for an image exposed since the viewfinder is on and not given yet; None if none comes."""
         deadline = time.monotonic() + PICTURE_WAIT_S
         while (since := self._since) is not None and time.monotonic() < deadline:
-            picture = self._feed.newest(self._seen, SLICE_S)
+            picture = self._feed.newest(self._seen, CHECK_S)
             if picture is not None:
                 self._seen = picture.index
                 if picture.t >= since:
@@ -104,13 +98,7 @@ class Viewfinder:
 
 
 class Shutter:
-    """Take stills, each on a thread of its own.
-
-    Args:
-        still: takes a full-size image now.
-        quality: of JPEG, 1 to 100.
-        delay_s: from the request to the exposure [s].
-    """
+    """Take stills, each on its own thread, with a delay from the request to the exposure [s]."""
 
     def __init__(self, still: Callable[[], Image], quality: int, delay_s: float) -> None:
         self._still, self._quality, self._delay_s = still, quality, delay_s
@@ -165,12 +153,7 @@ class CodeError(Exception):
 class S5isCamera:
     """The camera's operations; safe from any thread.
 
-    Args:
-        viewfinder: live images.
-        shutter: stills.
-        lens: zoom.
-        faults: active faults, of which this class uses "busy".
-        interrupt: sends an event's code and parameters to the initiator at once.
+    ``interrupt`` sends an event's code and parameters to the initiator at once. Of the faults, "busy" is used here.
     """
 
     def __init__(
@@ -205,8 +188,8 @@ class S5isCamera:
             OPEN: lambda words, data: self._open(words[0]),
             CLOSE: lambda words, data: self.disconnected(),
             SET_VALUE: lambda words, data: self._set(words[0], data),
-            START_SHOOTING: lambda words, data: self._shoot(True),
-            END_SHOOTING: lambda words, data: self._shoot(False),
+            START_SHOOTING: lambda words, data: self._set_shooting(True),
+            END_SHOOTING: lambda words, data: self._set_shooting(False),
             VIEWFINDER_ON: lambda words, data: self._viewfinder.switch(True),
             VIEWFINDER_OFF: lambda words, data: self._viewfinder.switch(False),
             CAPTURE: lambda words, data: self._capture(),
@@ -265,8 +248,9 @@ class S5isCamera:
         self._values[UNIX_TIME] = int(time.time())
 
     def _info(self) -> bytes:
-        codes = tuple(self._all if self._shooting else self._playing)
-        return DeviceInfo(EXTENSION, OPERATIONS, EVENTS, codes, FORMATS, MAKER, MODEL, VERSION, SERIAL).pack()
+        properties = self._all if self._shooting else self._playing
+        lists = (OPERATIONS, EVENTS, properties, (JPEG,), FORMATS)
+        return device_info(EXTENSION, lists, (MAKER, MODEL, VERSION, SERIAL))
 
     def _open(self, session: int) -> None:
         if self._session:
@@ -296,12 +280,12 @@ class S5isCamera:
         if code == ZOOM and isinstance(value, int):
             self._lens.command(min(value, self._lens.last))
 
-    def _shoot(self, on: bool) -> None:
+    def _set_shooting(self, on: bool) -> None:
         if on == self._shooting:
             raise CodeError(ALREADY_SO)
         self._shooting = on
         self._viewfinder.switch(False)
-        self._happen(MODE_CHANGED)
+        self._emit(MODE_CHANGED)
 
     def _capture(self) -> None:
         # The viewfinder is off until the still is taken: its next image is exposed after it.
@@ -319,10 +303,10 @@ class S5isCamera:
             if taken is not None:
                 self._handle += 1
                 self._taken = self._handle, taken, time.strftime("%Y%m%dT%H%M%S")
-                self._happen(OBJECT_TRANSFER, self._handle)
-            self._happen(CAPTURE_COMPLETE)
+                self._emit(OBJECT_TRANSFER, self._handle)
+            self._emit(CAPTURE_COMPLETE)
 
-    def _happen(self, code: int, *parameters: int) -> None:
+    def _emit(self, code: int, *parameters: int) -> None:
         mode = self._values[EVENT_EMULATE_MODE]
         if mode in CHECKED:
             length = 12 + 4 * len(parameters)
@@ -339,7 +323,7 @@ class S5isCamera:
     def _still_info(self, handle: int) -> bytes:
         _, still, date = self._still(handle)
         name = f"IMG_{handle - FIRST_HANDLE:04d}.JPG"
-        return ObjectInfo(MEMORY, len(still.jpeg), still.size, name, date).pack()
+        return object_info(MEMORY, len(still.jpeg), still.size, name, date)
 
 
 # Tables of operations, events and properties
@@ -421,7 +405,7 @@ def shooting(last: int) -> tuple[Property, ...]:
         Property(0xD00C, UINT8, 1, True, (1, 2, 3, 4)),  # shooting mode
         Property(0xD01D, UINT16, 40, False, ()),  # aperture
         Property(0xD01E, UINT16, 112, False, ()),  # shutter speed
-        Property(ZOOM, UINT16, 0, True, Range(0, last + DIGITAL)),
+        Property(ZOOM, UINT16, 0, True, range(last + DIGITAL + 1)),
         Property(0xD036, UINT8, 3, True, (1, 2, 3)),  # camera output
         Property(0xD037, UINT16, 1),  # Disp Av
         Property(0xD038, UINT16, 27),  # Av open apex

@@ -29,23 +29,14 @@ COPIED = ("board", "safety", "targets")  # tables of the simulated rig's file th
 
 @dataclasses.dataclass(frozen=True)
 class Ports:
-    """Address and ports to listen at; 0 for any free port.
+    """Address and ports to listen at; 0 for any free port."""
 
-    Attributes:
-        host: address of all servers.
-        head: TCP port of the head, beside its pseudo-terminal.
-        fixed: HTTP port of the video server.
-        zoom: PTP/IP port of the zoom camera.
-        board: port of the board's holder.
-        control: port for faults and ground truth.
-    """
-
-    host: str = LOCAL
-    head: int = 0
-    fixed: int = 0
-    zoom: int = 0
-    board: int = 0
-    control: int = 0
+    host: str = LOCAL  # address of all servers
+    head: int = 0  # TCP port of the head, beside its pseudo-terminal
+    fixed: int = 0  # HTTP port of the video server
+    zoom: int = 0  # PTP/IP port of the zoom camera
+    board: int = 0  # port of the board's holder
+    control: int = 0  # port for faults and ground truth
 
 
 class Emulation:
@@ -100,7 +91,7 @@ class Emulation:
                     faults=self.faults["zoom"],
                 )
             )
-            self.board = opened.enter_context(JsonLines(self._hold, ports.host, ports.board))
+            self.board = opened.enter_context(JsonLines(self._present_board, ports.host, ports.board))
             self.control = opened.enter_context(JsonLines(self._control, ports.host, ports.control))
             self._opened = opened.pop_all()
 
@@ -170,12 +161,12 @@ class Emulation:
         """Close the emulation."""
         self.close()
 
-    def _hold(self, said: Any) -> Any:
+    def _present_board(self, request: Any) -> Any:
         """Answer a request for the board."""
-        (what, wish), *more = said.items()
+        (what, wanted), *more = request.items()
         if more or what not in ("present", "swing"):
-            raise ConfigError(f"unknown wish '{what}'; valid here: present, swing")
-        T = None if wish is None else _parse_pose(wish)
+            raise ConfigError(f"unknown request '{what}'; valid here: present, swing")
+        T = None if wanted is None else _parse_pose(wanted)
         if what == "present":
             self.world.present(T)
         elif T is None:
@@ -184,9 +175,9 @@ class Emulation:
             self.world.swing(T)
         return {"ok": True}
 
-    def _control(self, said: Any) -> Any:
+    def _control(self, request: Any) -> Any:
         """Switch a fault on or off, or answer with ground truth."""
-        if "truth" in said:
+        if "truth" in request:
             pan, tilt = self.world.head_truth()
             now = self.world.clock.now()
             return {
@@ -199,7 +190,7 @@ class Emulation:
                 "lens": self.world.lens.position(),
                 "port": self.head.port,
             }
-        self.switch(str(said["fault"]), bool(said.get("on", True)))
+        self.switch(str(request["fault"]), bool(request.get("on", True)))
         return {"ok": True}
 
     def switch(self, fault: str, on: bool = True) -> None:
@@ -246,8 +237,8 @@ def copied_tables(table: Mapping[str, Any], directory: Path) -> dict[str, Any]:
     return copied
 
 
-def _parse_pose(wish: Any) -> RigidTransform:
-    translation, rotvec = ([float(v) for v in wish[key]] for key in ("translation", "rotvec_deg"))
+def _parse_pose(wanted: Any) -> RigidTransform:
+    translation, rotvec = ([float(v) for v in wanted[key]] for key in ("translation", "rotvec_deg"))
     if len(translation) != 3 or len(rotvec) != 3 or not all(map(math.isfinite, translation + rotvec)):
         raise ConfigError("a pose is {translation: [x, y, z], rotvec_deg: [rx, ry, rz]} of finite numbers")
     try:

@@ -16,17 +16,11 @@ from cotarget.rig import Image
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """One image of a camera.
+    """One image of a camera."""
 
-    Attributes:
-        image: (H, W, 3) BGR.
-        index: sequence number, increasing.
-        t: middle of the exposure on the machine's monotonic clock [s].
-    """
-
-    image: Image
-    index: int
-    t: float
+    image: Image  # (H, W, 3) BGR
+    index: int  # sequence number, increasing
+    t: float  # middle of the exposure on the machine's monotonic clock [s]
 
 
 def encode_jpeg(image: Image, quality: int, size: tuple[int, int] | None = None) -> bytes:

@@ -70,7 +70,7 @@ class EmulatedRig:
             self.addresses = self._read_addresses()
             host, _, port = self.addresses["control"].removeprefix("socket://").rpartition(":")
             self._connection = socket.create_connection((host, int(port)), ANSWER_S)
-            self._said = self._connection.makefile("rw", encoding="utf-8")
+            self._stream = self._connection.makefile("rw", encoding="utf-8")
         except BaseException:
             end(self.process)
             raise
@@ -104,7 +104,7 @@ class EmulatedRig:
 
     def close(self) -> None:
         """End the process; may be called again."""
-        self._said.close()
+        self._stream.close()
         self._connection.close()
         end(self.process)
 
@@ -126,11 +126,11 @@ class EmulatedRig:
             addresses[name] = address.strip()
         raise self._failure("did not start")
 
-    def _ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
         with self._lock:
-            self._said.write(json.dumps(question) + "\n")
-            self._said.flush()
-            line = self._said.readline()
+            self._stream.write(json.dumps(request) + "\n")
+            self._stream.flush()
+            line = self._stream.readline()
         if not line:
             raise self._failure("has ended")
         answer: dict[str, Any] = json.loads(line)
@@ -139,8 +139,8 @@ class EmulatedRig:
         return answer
 
     def _failure(self, what: str) -> DeviceError:
-        words = self.errors().strip().splitlines() or ["without a word"]
-        return DeviceError(f"the emulated rig {what}: {words[-1]}")
+        lines = self.errors().strip().splitlines() or ["without a message"]
+        return DeviceError(f"the emulated rig {what}: {lines[-1]}")
 
 
 def end(process: "subprocess.Popen[str]") -> None:

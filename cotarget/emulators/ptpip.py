@@ -54,17 +54,11 @@ class PtpError(CotargetError):
 
 @dataclass(frozen=True)
 class PtpReply:
-    """A device's answer to an operation.
-
-    Attributes:
-        code: response code.
-        parameters: of the response.
-        data: of an operation that returns data, even if empty; None for any other.
-    """
+    """A device's answer to an operation."""
 
     code: int = Code.OK
     parameters: tuple[int, ...] = ()
-    data: bytes | None = None
+    data: bytes | None = None  # of an operation that returns data, even if empty; None for any other
 
 
 class PtpDevice(Protocol):
@@ -101,7 +95,7 @@ def encode(kind: int, value: Value) -> bytes:
 
 
 def decode(kind: int, data: bytes) -> Value:
-    """Decode a value of a data type from all of the bytes.
+    """Decode a value of one of the data types above from all of the bytes.
 
     Raises:
         PtpError: the bytes are no such value.
@@ -110,8 +104,6 @@ def decode(kind: int, data: bytes) -> Value:
         if not data or len(data) != 1 + 2 * data[0] or (data[0] and data[-2:] != b"\0\0"):
             raise PtpError(f"PTP: {len(data)} bytes are no string")
         return data[1:].decode("utf-16-le", "replace").partition("\0")[0]
-    if kind & ~ARRAY not in WIDTHS:
-        raise PtpError(f"PTP: unknown data type {kind:#06x}")
     width = WIDTHS[kind & ~ARRAY]
     head = 4 if kind & ARRAY else 0
     count = int.from_bytes(data[:4], "little") if head else 1
@@ -123,76 +115,44 @@ def decode(kind: int, data: bytes) -> Value:
 
 
 @dataclass(frozen=True)
-class Range:
-    """Values from ``low`` to ``high`` in steps of ``step``."""
-
-    low: int
-    high: int
-    step: int = 1
-
-
-@dataclass(frozen=True)
 class Property:
-    """A property of a device.
-
-    Attributes:
-        code: number of the property.
-        kind: data type.
-        default: initial value.
-        writable: whether the initiator may set it.
-        form: valid values: a range, a list, or None for any value of the data type.
-    """
+    """A property of a device."""
 
     code: int
-    kind: int
+    kind: int  # data type
     default: Value
     writable: bool = False
-    form: Range | tuple[Value, ...] | None = None
+    form: range | tuple[Value, ...] | None = None  # valid values; None for any value of the data type
 
     def allows(self, value: Value) -> bool:
         """Return whether a value of the right type may be set."""
-        match self.form:
-            case None:
-                return True
-            case Range(low, high, step):
-                return isinstance(value, int) and low <= value <= high and (value - low) % step == 0
-            case values:
-                return value in values
+        return self.form is None or value in self.form
 
     def describe(self, current: Value) -> bytes:
         """Encode the dataset that describes the property, with its present value."""
         head = struct.pack("<HHB", self.code, self.kind, self.writable)
         head += encode(self.kind, self.default) + encode(self.kind, current)
-        match self.form:
-            case None:
-                return head + b"\0"
-            case Range(low, high, step):
-                return head + b"\1" + b"".join(encode(self.kind, value) for value in (low, high, step))
-            case values:
-                listed = b"".join(encode(self.kind, value) for value in values)
-                return head + b"\2" + struct.pack("<H", len(values)) + listed
+        if self.form is None:
+            return head + b"\0"
+        if isinstance(self.form, range):
+            values: tuple[Value, ...] = (self.form[0], self.form[-1], self.form.step)
+            head += b"\1"
+        else:
+            values = self.form
+            head += b"\2" + struct.pack("<H", len(values))
+        return head + b"".join(encode(self.kind, value) for value in values)
 
 
-@dataclass(frozen=True)
-class DeviceInfo:
-    """Identity and capabilities of a device: names, and lists of codes."""
+def device_info(extension: int, lists: Iterable[Iterable[int]], names: Iterable[str]) -> bytes:
+    """Encode the identity and the capabilities of a device with PTP 1.0.
 
-    extension: int  # registered number of the vendor's extension
-    operations: tuple[int, ...]
-    events: tuple[int, ...]
-    properties: tuple[int, ...]
-    formats: tuple[int, ...]  # of the objects on the device
-    maker: str
-    model: str
-    version: str
-    serial: str
-
-    def pack(self) -> bytes:
-        """Encode the dataset, of PTP 1.0, of a camera that captures JPEG."""
-        head = struct.pack("<HIH", 100, self.extension, 100) + string("") + struct.pack("<H", 0)
-        lists = (self.operations, self.events, self.properties, (JPEG,), self.formats)
-        names = (self.maker, self.model, self.version, self.serial)
-        return head + b"".join(array(codes, UINT16) for codes in lists) + b"".join(string(name) for name in names)
+    Args:
+        extension: registered number of the vendor's extension.
+        lists: codes of operations, events, properties, formats of captures, and formats of other objects.
+        names: maker, model, version and serial number.
+    """
+    head = struct.pack("<HIH", 100, extension, 100) + string("") + struct.pack("<H", 0)
+    return head + b"".join(array(codes, UINT16) for codes in lists) + b"".join(map(string, names))
 
 
 def storage_info(label: str) -> bytes:
@@ -200,23 +160,15 @@ def storage_info(label: str) -> bytes:
     return struct.pack("<HHHQQI", 3, 0x8001, 0, 0, 0, 0xFFFFFFFF) + string("") + string(label)
 
 
-@dataclass(frozen=True)
-class ObjectInfo:
-    """Description of an image in a camera's memory; sizes in bytes and pixels."""
+def object_info(storage: int, length: int, size: tuple[int, int], name: str, date: str) -> bytes:
+    """Encode the description of a JPEG (EXIF) image in a camera's memory, without a folder and without a thumbnail.
 
-    storage: int
-    length: int
-    size: tuple[int, int]
-    name: str
-    date: str  # of the capture, as "20080721T095816"
-
-    def pack(self) -> bytes:
-        """Encode the dataset of a JPEG (EXIF) image without a folder and without a thumbnail."""
-        plain = 0
-        head = struct.pack("<IHHI", self.storage, JPEG, plain, self.length)
-        thumb = struct.pack("<HIII", 0, 0, 0, 0)
-        rest = struct.pack("<IIIIHII", *self.size, 24, 0, 0, 0, 0)  # bits a pixel; parent, kind of folder, ..., number
-        return head + thumb + rest + string(self.name) + string(self.date) * 2 + string("")
+    The date is as in "20080721T095816", the length in bytes, and the size (width, height) in pixels.
+    """
+    plain, bits, none = 0, 24, 0
+    head = struct.pack("<IHHI", storage, JPEG, plain, length) + struct.pack("<HIII", none, none, none, none)
+    rest = struct.pack("<IIIIHII", *size, bits, none, none, none, none)  # parent, kind of folder, its words, number
+    return head + rest + string(name) + string(date) * 2 + string("")
 
 
 # PTP/IP: packets
@@ -318,7 +270,7 @@ def data_phase(transaction: int, data: bytes) -> Iterator[bytes]:
 
 LINE_FAULTS = ("hung", "slow", "cut")
 SLOW_S = 1.0  # delay of a slow answer; libgphoto2 waits for 2.5 s [s]
-SUCCESSION_S = 1.0  # time limit for a new initiator to wait for the end of the one before [s]
+HANDOVER_S = 1.0  # time limit for a new initiator to wait for the end of the one before [s]
 RECEIVE = 1 << 16  # bytes
 LONGEST_DATA = 1 << 20  # most data of an operation; a property's value takes a few bytes [bytes]
 SENDS_DATA = 2  # in the data phase field of a request
@@ -329,15 +281,10 @@ REJECTED, BUSY = 1, 2  # reasons of INIT_FAIL
 
 
 class CommandSession:
-    """The transactions of one command connection.
+    """The transactions of one command connection; operations are ignored while ``hung`` returns True."""
 
-    Args:
-        device: carries out the operations.
-        deaf: returns whether to ignore operations now.
-    """
-
-    def __init__(self, device: PtpDevice, deaf: Callable[[], bool] = lambda: False) -> None:
-        self._device, self._deaf = device, deaf
+    def __init__(self, device: PtpDevice, hung: Callable[[], bool] = lambda: False) -> None:
+        self._device, self._hung = device, hung
         self._code, self._transaction, self._parameters = 0, 0, (0,) * PARAMETERS  # of the latest request
         self._waits = False  # whether the request's data are incomplete
         self._total = -1  # announced bytes of its data; -1 before the announcement
@@ -379,7 +326,7 @@ class CommandSession:
         return []
 
     def _operate(self) -> list[bytes]:
-        if self._deaf():
+        if self._hung():
             return []
         answer = self._device.operate(self._code, self._parameters, self._data)
         phase: Iterable[bytes] = () if answer.data is None else data_phase(self._transaction, answer.data)
@@ -415,19 +362,21 @@ class PtpIpServer(TcpServer):
         self._device, self._guid, self._name, self._faults = device, guid, name, faults
         self._numbers = itertools.count(1)
         self._changed = threading.Condition()  # guards the attributes below
-        self._caller: int | None = None  # number of the command connection
-        self._ears: dict[int, socket.socket] = {}  # event connections by the number of their command connection
-        super().__init__(self._converse, host, port, absent)
+        self._initiator: int | None = None  # number of the command connection
+        self._event_connections: dict[
+            int, socket.socket
+        ] = {}  # event connections by the number of their command connection
+        super().__init__(self._serve_connection, host, port, absent)
 
     def send_event(self, code: int, parameters: Iterable[int]) -> None:
         """Send an event to the initiator, if it has an event connection."""
         with self._changed:
-            ear = None if self._caller is None else self._ears.get(self._caller)
-        if ear is not None and "hung" not in self._faults:
+            listener = None if self._initiator is None else self._event_connections.get(self._initiator)
+        if listener is not None and "hung" not in self._faults:
             with contextlib.suppress(OSError):  # the initiator is gone
-                ear.sendall(response(code, NO_TRANSACTION, parameters, Kind.EVENT))
+                listener.sendall(response(code, NO_TRANSACTION, parameters, Kind.EVENT))
 
-    def _converse(self, connection: socket.socket) -> None:
+    def _serve_connection(self, connection: socket.socket) -> None:
         with contextlib.suppress(PtpError):
             packets = split(self._pieces(connection))
             match next(packets, None):
@@ -449,10 +398,10 @@ class PtpIpServer(TcpServer):
         number = next(self._numbers)
         with self._changed:
             # A client may reconnect before the end of its first connection is noticed.
-            if not self._changed.wait_for(lambda: self._caller is None, SUCCESSION_S):
+            if not self._changed.wait_for(lambda: self._initiator is None, HANDOVER_S):
                 connection.sendall(init_fail(BUSY))
                 return
-            self._caller = number
+            self._initiator = number
         try:
             self._send(connection, [init_command_ack(number, self._guid, self._name)])
             session = CommandSession(self._device, lambda: "hung" in self._faults)
@@ -461,14 +410,14 @@ class PtpIpServer(TcpServer):
         finally:
             self._device.disconnected()
             with self._changed:
-                self._caller = None
+                self._initiator = None
                 self._changed.notify_all()
 
     def _events(self, connection: socket.socket, packets: Iterator[Packet], number: int) -> None:
         with self._changed:
-            known = number == self._caller and number not in self._ears
+            known = number == self._initiator and number not in self._event_connections
             if known:
-                self._ears[number] = connection
+                self._event_connections[number] = connection
         if not known:
             connection.sendall(init_fail(REJECTED))
             return
@@ -479,7 +428,7 @@ class PtpIpServer(TcpServer):
                     self._send(connection, [packet(Kind.PROBE_RESPONSE)])
         finally:
             with self._changed:
-                del self._ears[number]
+                del self._event_connections[number]
 
     def _send(self, connection: socket.socket, packets: list[bytes]) -> None:
         if not packets or "hung" in self._faults:

@@ -6,7 +6,6 @@ direction. Times are planned ahead of the clock, so that a thread that wakes lat
 """
 
 import contextlib
-import fcntl
 import json
 import os
 import random
@@ -43,7 +42,7 @@ def open_listener(host: str, port: int) -> socket.socket:
 
 # TCP servers
 
-LOOK_S = 0.05  # period of checking whether the device is absent or the server closes [s]
+CHECK_S = 0.05  # period of checking whether the device is absent or the server closes [s]
 
 
 class TcpServer:
@@ -53,7 +52,7 @@ class TcpServer:
         serve: serves a connection, which is closed afterwards; an OSError ends it.
         host: address to listen at.
         port: to listen at; 0 for any free port.
-        absent: returns whether the device is unplugged now, which closes the port; called every `LOOK_S`.
+        absent: returns whether the device is unplugged now, which closes the port; called every `CHECK_S`.
 
     Attributes:
         closing: set when the server closes; long waits in ``serve`` must end then.
@@ -83,7 +82,7 @@ class TcpServer:
         """Close the port and the connections, and wait for the threads; may be called again."""
         self.closing.set()
         self._acceptor.join()
-        self._hang_up()
+        self._disconnect()
         for thread in self._threads:
             thread.join()
 
@@ -98,19 +97,19 @@ class TcpServer:
     def _accept(self) -> None:
         while not self.closing.is_set():
             if self._absent():
-                self._hang_up()
-                self.closing.wait(LOOK_S)
+                self._disconnect()
+                self.closing.wait(CHECK_S)
                 continue
             try:
                 self._listener = self._listener or open_listener(self.host, self.port)
             except DeviceError:  # another program has the port for now
-                self.closing.wait(LOOK_S)
+                self.closing.wait(CHECK_S)
                 continue
-            self._listener.settimeout(LOOK_S)
+            self._listener.settimeout(CHECK_S)
             with contextlib.suppress(OSError):  # no client in time, or it is gone already
-                self._welcome(self._listener.accept()[0])
+                self._start(self._listener.accept()[0])
 
-    def _welcome(self, connection: socket.socket) -> None:
+    def _start(self, connection: socket.socket) -> None:
         connection.settimeout(None)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with self._lock:
@@ -128,7 +127,7 @@ class TcpServer:
                 self._open.discard(connection)
                 connection.close()
 
-    def _hang_up(self) -> None:
+    def _disconnect(self) -> None:
         if self._listener is not None:
             self._listener.close()
             self._listener = None
@@ -156,9 +155,9 @@ class JsonLines(TcpServer):
 
     def __init__(self, answer: Callable[[Any], Any], host: str = LOCAL, port: int = 0) -> None:
         self._answer = answer
-        super().__init__(self._converse, host, port)
+        super().__init__(self._serve_lines, host, port)
 
-    def _converse(self, connection: socket.socket) -> None:
+    def _serve_lines(self, connection: socket.socket) -> None:
         with connection.makefile("rb") as lines:
             while line := lines.readline(LONGEST_LINE):
                 connection.sendall(json.dumps(self._answered(line)).encode() + b"\n")
@@ -212,12 +211,9 @@ class Wire:
         self._in_free = self._out_free = 0.0
 
     def feed(self, data: bytes, now: float, baud: int | None = None) -> None:
-        """Put bytes from the client on the wire.
+        """Put bytes from the client on the wire now [s].
 
-        Args:
-            data: the bytes.
-            now: when they were sent [s].
-            baud: the client's baud rate; if it differs from the firmware's, noise arrives. None for the firmware's own.
+        If the client's baud rate differs from the firmware's, noise arrives; None is the firmware's own.
         """
         for byte in data:
             self._in_free = max(self._in_free, now) + BITS / (baud or self._firmware.baud)
@@ -268,10 +264,9 @@ class UnitPorts:
     """The ports of a unit, which serve one program at a time; a context manager.
 
     The pseudo-terminal behaves as a serial port: a client with another baud rate than the unit exchanges noise with it.
-    The TCP port is as of a serial device server. Its client locks the pseudo-terminal and is refused where another
-    program has locked it. A second client replaces the first, because one that vanished, such as by a pulled cable,
-    would otherwise block the unit for ever. While the fault unplugged is on, there are no ports; afterwards the
-    pseudo-terminal may have another name.
+    The TCP port is as of a serial device server. While it has a client, the pseudo-terminal is not served. A second
+    client replaces the first, because one that vanished, such as by a pulled cable, would otherwise block the unit for
+    ever. While the fault unplugged is on, there are no ports; afterwards the pseudo-terminal may have another name.
 
     Args:
         firmware: the unit.
@@ -369,13 +364,13 @@ class UnitPorts:
         sources = (self._listener, self._client, None if self._ends is None else self._ends[0])
         for source in select.select([source for source in sources if source is not None], [], [], timeout)[0]:
             if source is self._listener:
-                self._admit()
+                self._accept_client()
             elif source is self._client:
-                self._hear()
+                self._receive()
             elif self._ends is not None and source == self._ends[0]:
                 with contextlib.suppress(BlockingIOError):
                     data = os.read(source, RECEIVE)
-                    if self._client is None:  # otherwise the port is locked
+                    if self._client is None:
                         self._wire.feed(data, time.monotonic(), self._baud())
 
     def _baud(self) -> int | None:
@@ -394,7 +389,7 @@ class UnitPorts:
             with contextlib.suppress(BlockingIOError):  # without a reader a serial port loses bytes
                 os.write(self._ends[0], data)
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         assert self._client is not None
         try:
             data = self._client.recv(RECEIVE)
@@ -405,32 +400,17 @@ class UnitPorts:
         else:
             self._drop_client()
 
-    def _admit(self) -> None:
+    def _accept_client(self) -> None:
         assert self._listener is not None
         self._drop_client()
         with contextlib.suppress(OSError):  # the client is gone already
-            newcomer = self._listener.accept()[0]
-            if not self._lock():
-                newcomer.close()
-                return
-            newcomer.settimeout(SEND_TIMEOUT_S)
-            newcomer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._client = newcomer
+            self._client = self._listener.accept()[0]
+            self._client.settimeout(SEND_TIMEOUT_S)
+            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._firmware.connected()
-
-    def _lock(self) -> bool:
-        """Lock the pseudo-terminal against programs that lock it too; return False if one has the lock."""
-        try:
-            if self._ends is not None:
-                fcntl.flock(self._ends[1], fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return False
-        return True
 
     def _drop_client(self) -> None:
         if self._client is not None:
             self._client.close()
             self._client = None
-            if self._ends is not None:
-                fcntl.flock(self._ends[1], fcntl.LOCK_UN)
             self._wire.clear()

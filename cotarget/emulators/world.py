@@ -59,19 +59,19 @@ class EmulatedAxis:
 
     def __init__(self, axis: Axis, clock: WallClock, step: float, delay: float) -> None:
         self._axis, self._clock, self._step, self._delay = axis, clock, step, delay
-        self._rests = 0.0
+        self._stops_at = 0.0
         self._lock = threading.Lock()
 
     def command(self, goal: int, speed: float, acceleration: float) -> None:
         """Start a move to a goal [steps], at a speed [steps/s] and an acceleration [steps/s^2]."""
         with self._lock:
-            t = self._begin(acceleration)
-            self._rests = self._axis.command(t, goal * self._step, speed * abs(self._step))
+            t = self._start_time(acceleration)
+            self._stops_at = self._axis.command(t, goal * self._step, speed * abs(self._step))
 
     def halt(self, acceleration: float) -> None:
         """Start braking at an acceleration [steps/s^2]."""
         with self._lock:
-            self._rests = self._axis.halt(self._begin(acceleration))
+            self._stops_at = self._axis.halt(self._start_time(acceleration))
 
     def position(self) -> int:
         """Return the present position [steps]."""
@@ -83,9 +83,9 @@ class EmulatedAxis:
 
     def moving(self) -> bool:
         """Return whether the axis moves, or is about to."""
-        return self._clock.now() < self._rests
+        return self._clock.now() < self._stops_at
 
-    def _begin(self, acceleration: float) -> float:
+    def _start_time(self, acceleration: float) -> float:
         """Return when a command given now takes effect [s]."""
         if math.isfinite(self._axis.acceleration):
             self._axis.acceleration = acceleration * abs(self._step)
@@ -97,7 +97,7 @@ class EmulatedLens:
 
     def __init__(self, drive: LensDrive, clock: WallClock, delay: float) -> None:
         self._drive, self._clock, self._delay = drive, clock, delay
-        self._rests = 0.0
+        self._stops_at = 0.0
         self._lock = threading.Lock()
 
     @property
@@ -109,7 +109,7 @@ class EmulatedLens:
         """Start a move to a position."""
         with self._lock:
             t = self._clock.now() + self._delay
-            self._rests = self._drive.axis.command(t, float(min(max(position, 0), self.last)))
+            self._stops_at = self._drive.axis.command(t, float(min(max(position, 0), self.last)))
 
     def position(self) -> int:
         """Return the present position."""
@@ -117,17 +117,17 @@ class EmulatedLens:
 
     def moving(self) -> bool:
         """Return whether the lens moves, or is about to."""
-        return self._clock.now() < self._rests
+        return self._clock.now() < self._stops_at
 
 
 # The world
 
 FIXED_HZ, ZOOM_HZ = 15.0, 10.0  # frame rates that one core renders, with a client on another core
-OLDEST = 4.0  # age of the oldest exposure that is rendered, after the program was suspended [s]
+OLDEST_S = 4.0  # age of the oldest exposure that is rendered, after the program was suspended [s]
 STILL_TIMEOUT = 5.0  # [s]
 START_TIMEOUT = 60.0  # time limit to compile the world and open OpenGL on a slow machine [s]
 STILL_INDEX = 1_000_000_000  # first frame index of stills, whose noise must differ from the stream's
-UNTIL_NEXT_LOOK = 0.25  # longest wait without checking for the end [s]
+CHECK_S = 0.25  # period of checking for the end [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,9 +258,9 @@ class LiveWorld:
             for name in cameras:
                 world.expose(name, 0, 0.0)  # each camera's first render compiles shaders, which takes seconds
             self._started.put(world)
-            self._show(world, cameras)
+            self._expose_frames(world, cameras)
 
-    def _show(self, world: SimWorld, cameras: Mapping[CameraName, SimCamera]) -> None:
+    def _expose_frames(self, world: SimWorld, cameras: Mapping[CameraName, SimCamera]) -> None:
         """Expose both cameras at their rates, and stills on request."""
         latency = self.config.sim.effects.latency
         next_index = {name: math.ceil(self.clock.now() * camera.rate_hz) for name, camera in cameras.items()}
@@ -280,7 +280,7 @@ class LiveWorld:
             t = index / rate
             wait = t - self.clock.now()
             if wait > 0:
-                self._ended.wait(min(wait, UNTIL_NEXT_LOOK))
+                self._ended.wait(min(wait, CHECK_S))
                 continue
             image = self._expose(world, name, index, t)
             if image is not None:
@@ -299,7 +299,7 @@ class LiveWorld:
             raise
 
     def _is_forgotten(self, t: float) -> bool:
-        return self.clock.now() - t > OLDEST
+        return self.clock.now() - t > OLDEST_S
 
     def _publish(self) -> None:
         """Publish images when they are due."""

@@ -63,10 +63,10 @@ class Watch:
     def until(self, end_s: float, process: "subprocess.Popen[str] | None" = None) -> None:
         """Record until a time on the machine's monotonic clock, or until a process has ended."""
         while time.monotonic() < end_s and (process is None or process.poll() is None):
-            told = self.emulated.truth()
-            self.times.append(told["t"])
-            self.angles.append((told["pan_deg"], told["tilt_deg"]))
-            self.off.append(float(np.hypot(*(directions(told["world"]) - self.angles[-1]))))
+            truth = self.emulated.truth()
+            self.times.append(truth["t"])
+            self.angles.append((truth["pan_deg"], truth["tilt_deg"]))
+            self.off.append(float(np.hypot(*(directions(truth["world"]) - self.angles[-1]))))
             time.sleep(EVERY_S)
 
     def rests(self, since: float) -> list[tuple[float, float]]:

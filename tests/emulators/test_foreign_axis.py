@@ -1,4 +1,4 @@
-"""Other people's clients against the emulated Axis 241Q: curl, ffmpeg, OpenCV's VideoCapture and PyPI's axis."""
+"""Other programs against the emulated Axis 241Q: curl, ffmpeg, OpenCV's VideoCapture and PyPI's axis."""
 
 import asyncio
 import contextlib

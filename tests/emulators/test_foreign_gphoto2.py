@@ -19,7 +19,7 @@ TIMEOUT_S = 60  # gphoto2's own waits add up to a few seconds
 # Grey levels by which the decoded JPEG of an even area may differ, colours too.
 GREY = 4.0
 STILL_SIZE = (3264, 2448)
-# Lines of what a real one told gphoto2 (libgphoto2, camlibs/ptp2/cameras/canon-s5.txt), in both modes, and shooting.
+# Lines that gphoto2 printed of a real camera (camlibs/ptp2/cameras/canon-s5.txt): in both modes, and in shooting mode.
 ALWAYS = (
     "Model: Canon PowerShot S5 IS",
     "Capture Formats: JPEG",
@@ -115,7 +115,7 @@ def said(done):
     return done.stdout
 
 
-def test_it_is_taken_for_an_s5_is(gphoto2):
+def test_it_is_recognised_as_an_s5_is(gphoto2):
     playing = said(gphoto2("--summary"))
     shooting = said(gphoto2("--set-config", "capture=1", "--summary"))
     for line in ALWAYS:
@@ -152,7 +152,7 @@ def test_it_zooms(gphoto2, camera):
     assert len(camera.lens.commands) == moves
 
 
-def test_it_looks_and_shoots(gphoto2, camera, tmp_path):
+def test_it_gives_previews_and_stills(gphoto2, camera, tmp_path):
     zoomed = ("--set-config", "capture=1", "--set-config", "zoom=90")
     said(gphoto2(*zoomed, "--capture-preview", "--capture-image-and-download"))
     assert camera.lens.position() == 90
@@ -160,13 +160,13 @@ def test_it_looks_and_shoots(gphoto2, camera, tmp_path):
     assert_shows(tmp_path / "capt0000.jpg", STILL_SIZE, 90)
 
 
-def test_it_shoots_without_being_prepared(gphoto2, tmp_path):
+def test_it_takes_a_still_in_play_mode(gphoto2, tmp_path):
     said(gphoto2("--capture-image-and-download", "--filename", "still.jpg"))
     assert_shows(tmp_path / "still.jpg", STILL_SIZE, 0)
 
 
 @pytest.mark.parametrize("fault", ["busy", "hung", "gone", "power-off"])
-def test_it_fails_in_words(gphoto2, camera, fault):
+def test_faults_end_in_an_error_message(gphoto2, camera, fault):
     said(gphoto2("--set-config", "capture=1"))
     camera.faults.set(fault)
     failed = gphoto2("--set-config", "capture=1", "--set-config", "zoom=50")
@@ -180,7 +180,7 @@ def test_it_fails_in_words(gphoto2, camera, fault):
     assert camera.lens.position() == 51
 
 
-def test_a_picture_that_is_cut(gphoto2, camera):
+def test_a_summary_is_cut_once(gphoto2, camera):
     camera.faults.set("cut")
     assert gphoto2("--summary").returncode != 0
     said(gphoto2("--summary"))

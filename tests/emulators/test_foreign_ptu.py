@@ -1,4 +1,4 @@
-"""The emulated PTU-D46 driven by other people's programs: MRPT's CPtuDPerception and PyPI's flir-ptu."""
+"""The emulated PTU-D46 driven by other programs: MRPT's CPtuDPerception and PyPI's flir-ptu."""
 
 import math
 import shutil

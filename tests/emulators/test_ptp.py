@@ -13,13 +13,10 @@ from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptpip import (
     Code,
     CommandSession,
-    DeviceInfo,
     Kind,
-    ObjectInfo,
     Property,
     PtpError,
     PtpReply,
-    Range,
     data_phase,
     packet,
     response,
@@ -39,8 +36,8 @@ def test_packets_arrive_in_pieces_or_together(packets, size):
     assert list(split(stream[at : at + size] for at in range(0, len(stream), size))) == packets
 
 
-@pytest.mark.parametrize("sent", ["07000000 06000000", "01001000 06000000"])  # shorter than its head; above 1 MiB
-def test_what_is_no_packet(sent):
+@pytest.mark.parametrize("sent", ["07000000 06000000", "01001000 06000000"])  # shorter than its header; above 1 MiB
+def test_a_packet_of_an_impossible_length_is_refused(sent):
     with pytest.raises(PtpError):
         list(split([bytes.fromhex(sent)]))
 
@@ -55,9 +52,6 @@ def test_packets_of_a_responder():
     assert response(0xC009, ptpip.NO_TRANSACTION, (6,), Kind.EVENT) == bytes.fromhex(
         "12000000 08000000 09c0 ffffffff 06000000"
     )
-
-
-def test_a_data_phase():
     assert b"".join(data_phase(4, b"abc")) == bytes.fromhex(
         "14000000 09000000 04000000 0300000000000000  0f000000 0c000000 04000000 616263"
     )
@@ -66,7 +60,7 @@ def test_a_data_phase():
     )
 
 
-@pytest.mark.parametrize("length", [65535, 65536, 65537, 131072, 200000])
+@pytest.mark.parametrize("length", [65536, 65537, 131072])
 def test_a_long_data_phase(length):
     data = random.Random(length).randbytes(length)
     start, *pieces = split(data_phase(4, data))
@@ -98,14 +92,9 @@ def test_values(kind, value, coded):
             ptpip.decode(kind, wrong)
 
 
-def test_a_type_that_there_is_not():
-    with pytest.raises(PtpError, match="0x000b"):
-        ptpip.decode(11, b"\0")
-
-
 def test_descriptions_of_properties():
-    # code, type UINT16, writable, default 0, now 64, range, 0 to 134 by 1
-    zoom = Property(0xD02A, ptpip.UINT16, 0, True, Range(0, 134))
+    # code, type UINT16, writable, default 0, now 64, a range: 0 to 134 by 1
+    zoom = Property(0xD02A, ptpip.UINT16, 0, True, range(135))
     assert zoom.describe(64) == bytes.fromhex("2ad0 0400 01 0000 4000 01 0000 8600 0100")
     aperture = Property(0xD01D, ptpip.UINT16, 40, False, ())  # a list of nothing
     assert aperture.describe(40) == bytes.fromhex("1dd0 0400 00 2800 2800 02 0000")
@@ -113,13 +102,13 @@ def test_descriptions_of_properties():
     assert metering.describe(0) == bytes.fromhex("10d0 0200 01 03 00 02 0300 03 00 01")
     assert Property(0xD038, ptpip.UINT16, 27).describe(27) == bytes.fromhex("38d0 0400 00 1b00 1b00 00")
     assert [zoom.allows(value) for value in (-1, 0, 134, 135)] == [False, True, True, False]
-    assert [Property(1, ptpip.UINT8, 1, True, Range(1, 9, 4)).allows(value) for value in (5, 6)] == [True, False]
+    assert [Property(1, ptpip.UINT8, 1, True, range(1, 10, 4)).allows(value) for value in (5, 6)] == [True, False]
     assert [metering.allows(value) for value in (1, 2)] == [True, False]
 
 
 def test_info_of_a_device():
-    info = DeviceInfo(0xB, (0x1001, 0x1002), (0x4002,), (), (0x3801,), "C", "S5", "1", "")
-    assert info.pack() == bytes.fromhex(
+    lists = (0x1001, 0x1002), (0x4002,), (), (0x3801,), (0x3801,)
+    assert ptpip.device_info(0xB, lists, ("C", "S5", "1", "")) == bytes.fromhex(
         "6400 0b000000 6400 00 0000"  # version 1.00, extension 0xB of version 1.00, no words on it, standard mode
         "02000000 0110 0210  01000000 0240  00000000  01000000 0138  01000000 0138"
         "02 4300 0000  03 5300 3500 0000  02 3100 0000  00"
@@ -127,7 +116,7 @@ def test_info_of_a_device():
 
 
 def test_info_of_an_object():
-    packed = ObjectInfo(0x80000001, 4321, (3264, 2448), "A", "20080721T095816").pack()
+    packed = ptpip.object_info(0x80000001, 4321, (3264, 2448), "A", "20080721T095816")
     assert packed[:52] == struct.pack(
         "<IHHIHIIIIIIIHII", 0x80000001, 0x3801, 0, 4321, 0, 0, 0, 0, 3264, 2448, 24, 0, 0, 0, 0
     )
@@ -233,7 +222,7 @@ def test_packets_malformed_or_out_of_turn(packets):
         session.receive(*packets[-1])
 
 
-def test_the_deaf_do_and_answer_nothing():
+def test_a_hung_device_does_and_answers_nothing():
     device = Echo()
     assert CommandSession(device, lambda: True).receive(*request(0x1001, 1)) == []
     assert device.asked == []
@@ -269,7 +258,7 @@ CUT = st.tuples(st.integers(0, 120), st.integers(0, 8), st.binary(max_size=8))
     shooting=st.booleans(),
 )
 @PROPERTY
-def test_noise_is_refused_and_answers_are_whole_packets(operations, cuts, shooting):
+def test_noise_is_refused_in_whole_packets(operations, cuts, shooting):
     viewfinder = Instant()
     camera = S5isCamera(viewfinder, viewfinder, LensModel(), Faults(S5IS_FAULTS), lambda code, parameters: None)
     camera.operate(OPEN, (1, 0, 0, 0, 0), b"")
@@ -291,14 +280,3 @@ def test_noise_is_refused_and_answers_are_whole_packets(operations, cuts, shooti
     assert set(kinds) <= {Kind.RESPONSE, Kind.START_DATA, Kind.DATA, Kind.END_DATA, Kind.PROBE_RESPONSE}
     if not cuts:
         assert kinds.count(Kind.RESPONSE) == len(operations)
-
-
-@given(kind=st.integers(0, 11) | st.integers(0x4000, 0x400B) | st.just(ptpip.STRING), content=st.binary(max_size=20))
-@PROPERTY
-def test_what_is_decoded_is_encoded_again(kind, content):
-    try:
-        value = ptpip.decode(kind, content)
-    except PtpError:
-        return
-    if kind != ptpip.STRING:  # what follows a zero inside of a string is lost
-        assert ptpip.encode(kind, value) == content

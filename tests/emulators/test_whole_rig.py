@@ -1,4 +1,4 @@
-"""The whole system over the wire: commands drive an emulated rig in another process, which tells the truth about it."""
+"""The whole system over the wire: commands drive an emulated rig in another process."""
 
 import csv
 import json
@@ -8,7 +8,6 @@ import re
 import signal
 import socket
 import time
-from itertools import pairwise
 from statistics import median
 
 import av
@@ -159,7 +158,7 @@ def test_an_unknown_fault_is_refused(rig):
 
 
 @stands
-def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
+def test_a_book_is_aimed_at_and_the_replay_gives_the_same(rig, capsys):
     table, again, recording = (rig.folder / name for name in ("wire.csv", "again.csv", "recording"))
     status, out, err = run(capsys, *follow(rig, "--seconds", STANDS_S, "--csv", table, "--record", recording))
     assert status == 0
@@ -167,7 +166,7 @@ def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
     states = json.loads(out)["states"]
     assert states["following"] > 0.8 * sum(states.values())
 
-    # Where the book is by the file, not by what anybody saw.
+    # The book's place by the file, independent of any measurement.
     config, (x, y, z) = load_config(rig.hardware_toml), BOOK_M
     book = config.target("book")
     assert book.wanted_px == rig.sim.target("book").wanted_px / 2  # as the viewfinder's pictures are half
@@ -193,7 +192,7 @@ def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
 
 @stands
 def test_the_rig_that_is_written_can_be_stopped(rig, capsys):
-    """Though the simulated one's file names no stop file."""
+    """The simulated rig's file names no stop file."""
     assert run(capsys, "stop", "--rig", rig.hardware_toml)[0] == 0
     assert (rig.folder / "stop").exists()
     assert "emergency stop" in run(capsys, *follow(rig, "--seconds", "1"))[2]
@@ -201,7 +200,7 @@ def test_the_rig_that_is_written_can_be_stopped(rig, capsys):
 
 
 @stands
-def test_the_simulation_opened_directly_aims_as_it_does_over_the_wire(rig, capsys):
+def test_the_simulation_opened_directly_aims_as_over_the_wire(rig, capsys):
     wire, direct = rig.folder / "wire.csv", rig.folder / "direct.csv"
     assert run(capsys, *follow(rig, "--seconds", STANDS_S, "--csv", direct, rig_toml=rig.sim_toml))[0] == 0
     for _ in range(RUNS):
@@ -212,23 +211,11 @@ def test_the_simulation_opened_directly_aims_as_it_does_over_the_wire(rig, capsy
 
 
 @pytest.mark.slow
-@stands
-def test_a_rig_is_calibrated_over_the_wire(rig, capsys):
-    check_calibration(rig, capsys, placements=7, stops=1)
-
-
-@pytest.mark.slow
 @short_lens
 def test_a_rig_is_calibrated_over_the_wire_at_two_focal_lengths(rig, capsys):
-    found = check_calibration(rig, capsys, placements=8, stops=2)
-    assert len(found.zoom_head.lens.stops) == 2
-
-
-def check_calibration(rig, capsys, placements, stops):
-    """Calibrate, and compare where it points with where the truth points."""
     out = rig.folder / "found.json"
     files = ["--rig", rig.hardware_toml, "--out", out]
-    status, said, err = run(capsys, "calibrate", *files, "--placements", placements, "--stops", stops)
+    status, said, err = run(capsys, "calibrate", *files, "--placements", 8, "--stops", 2)
     assert status == 0, err
     said, truth, found = json.loads(said), load_calibration(rig.calibration), load_calibration(out)
     assert said["baseline_m"] == pytest.approx(
@@ -249,7 +236,7 @@ def check_calibration(rig, capsys, placements, stops):
     missed = math.degrees(math.sqrt(np.mean(np.square(misses))))
     assert missed < PREDICTED_TIMES * predicted
     assert predicted < WORST_DEG
-    return found
+    assert len(found.zoom_head.lens.stops) == 2
 
 
 def follow_until_it_breaks(rig, capsys, fault, more=()):
@@ -314,30 +301,11 @@ def test_every_fault_is_survived_or_ends_in_one_line(rig, capsys, fault):
         assert watch.rests_since() - at < LASTING.get(fault, RESTS_S)
 
 
-@pytest.mark.slow
-@moves
-def test_a_gap_in_the_stream_is_survived(rig, capsys):
-    def break_it():
-        wait_until_it_turns(rig)
-        rig.switch("fixed.cut")
-        time.sleep(0.2)
-        rig.switch("fixed.cut", on=False)
-
-    table = rig.folder / "gap.csv"
-    with Watch(rig) as watch, meanwhile(break_it):
-        status, _, err = run(capsys, *follow(rig, "--seconds", "5", "--csv", table))
-    assert status == 0
-    reasons(err, "follow")
-    assert stays_within_limits(watch)
-    gaps = [float(b["t_fixed_s"]) - float(a["t_fixed_s"]) for a, b in pairwise(rows(table))]
-    assert 0.2 <= max(gaps) < 1.0
-
-
 @moves
 @pytest.mark.parametrize(
     ("number", "shell"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
 )
-def test_a_signal_ends_in_a_head_that_rests(rig, number, shell):
+def test_a_signal_halts_the_head(rig, number, shell):
     with Watch(rig) as watch, program(*follow(rig, "--seconds", "60")) as process:
         wait_until_it_turns(rig)
         at = rig.truth()["t"]
@@ -353,7 +321,7 @@ def test_a_signal_ends_in_a_head_that_rests(rig, number, shell):
 
 @pytest.mark.slow
 @moves
-def test_an_operator_elsewhere_stops_it_until_it_is_cleared(rig, capsys):
+def test_an_emergency_stop_holds_until_it_is_cleared(rig, capsys):
     at = []
 
     def stop():
@@ -377,11 +345,14 @@ def test_an_operator_elsewhere_stops_it_until_it_is_cleared(rig, capsys):
     assert err.startswith(why)
     assert run(capsys, "clear", "--rig", rig.hardware_toml) == (0, "cleared: somebody is in the way\n", "")
     assert run(capsys, "clear", "--rig", rig.hardware_toml)[1].endswith("stop: there was no stop\n")
-    assert run(capsys, *follow(rig, "--seconds", "0.3"))[0] in (0, 4)  # it moves again; so short a run may see nobody
+    assert run(capsys, *follow(rig, "--seconds", "0.3"))[0] in (
+        0,
+        4,
+    )  # it moves again; so short a run may not see the book
 
 
 @moves
-def test_a_head_that_another_program_has_is_not_taken(rig, capsys):
+def test_a_head_in_use_by_another_program_is_not_opened(rig, capsys):
     port = load_config(rig.hardware_toml).hardware.head["port"]
     wait_until_it_rests(rig)
     before = rig.truth()
@@ -393,8 +364,8 @@ def test_a_head_that_another_program_has_is_not_taken(rig, capsys):
 
 @pytest.mark.slow
 @moves
-def test_a_head_that_is_taken_away_on_a_network_ends_in_one_line(rig, capsys):
-    """A terminal server serves one; here who comes last, so that one whose cable was pulled does not keep it."""
+def test_a_second_network_client_of_the_head_ends_the_run_in_one_line(rig, capsys):
+    """The emulator serves the last client, so that one whose cable was pulled does not block it."""
     serial_port = load_config(rig.hardware_toml).hardware.head["port"]
     address = rig.addresses["head"].rsplit("socket://", 1)[1]
     text = rig.hardware_toml.read_text()
@@ -418,7 +389,7 @@ def test_a_head_that_is_taken_away_on_a_network_ends_in_one_line(rig, capsys):
 
 
 @moves
-def test_a_wrong_password_is_told(rig, capsys, monkeypatch):
+def test_a_wrong_password_is_named(rig, capsys, monkeypatch):
     monkeypatch.setenv("COTARGET_PASSWORD", "guessed")
     wait_until_it_rests(rig)
     before = rig.truth()
@@ -432,7 +403,7 @@ def test_a_wrong_password_is_told(rig, capsys, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_all_plugs_pulled_at_once_end_in_one_error_and_whole_files(number, tmp_path):
+def test_a_dead_emulator_ends_in_one_error_and_whole_files(number, tmp_path):
     table, options = RIGS["a book that moves"]
     (tmp_path / "rig").mkdir()
     film, steps, recording = (tmp_path / name for name in ("film.mp4", "steps.csv", "recording"))

@@ -66,19 +66,19 @@ def test_figures_from_rows():
         {"figure": "latency", "what": "zoom", "measured_s": 0.075, "truth_s": 0.064, "load": 1.0},
         {"figure": "parity", "pan_steps": 1.0000000001, "tilt_steps": 0.0, "load": 1.0},
     ]
-    told = summarise(rows)
-    reached = {name.split(",")[0]: figure["reached"] for name, figure in told["figures"].items()}
+    summary = summarise(rows)
+    reached = {name.split(",")[0]: figure["reached"] for name, figure in summary["figures"].items()}
     assert reached["polls"]
-    assert told["figures"]["age of the newest frame, longest"]["measured"] == pytest.approx(40)
-    assert not told["figures"]["age, last third less first"]["reached"]
-    assert told["faults"]["fixed.cut held"]["settled [s]"] == math.inf
-    assert told["figures"]["faults of 2 for which that took longer"]["measured"] == 1
+    assert summary["figures"]["age of the newest frame, longest"]["measured"] == pytest.approx(40)
+    assert not summary["figures"]["age, last third less first"]["reached"]
+    assert summary["faults"]["fixed.cut held"]["settled [s]"] == math.inf
+    assert summary["figures"]["faults of 2 for which that took longer"]["measured"] == 1
     assert not reached["latency"]
     assert reached["parity"]
-    assert told["load"] == [0.5, 2.0]
-    assert len(missed(told)) == 4
+    assert summary["load"] == [0.5, 2.0]
+    assert len(missed(summary)) == 4
     assert missed(summarise(rows[:1])) == []
-    assert bounded(told)["latency, zoom"] == pytest.approx(11.0)
+    assert bounded(summary)["latency, zoom"] == pytest.approx(11.0)
 
 
 def test_each_figure_is_a_job(monkeypatch):

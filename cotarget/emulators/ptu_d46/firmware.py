@@ -141,14 +141,14 @@ def _execution(immediate: bool) -> Callable[[Unit, UnitAxis], str]:
 
 def _await_arrival(unit: Unit, _: UnitAxis) -> Answer:
     unit.release_pending()
-    return unit.standing(*unit.axes)
+    return unit.wait_until_still(*unit.axes)
 
 
 def _halt(unit: Unit, *axes: UnitAxis) -> Answer:
     for axis in axes:
         axis.velocity = 0
         axis.halt()
-    return unit.standing(*axes) if unit.profile.halt_waits else ""
+    return unit.wait_until_still(*axes) if unit.profile.halt_waits else ""
 
 
 def _mode(unit: Unit, _: UnitAxis) -> str:
@@ -360,7 +360,7 @@ class D46:
         for character in data:
             if len(self._input) < INPUT_BUFFER:
                 self._input.append(character)
-            self._work()
+            self._process_input()
 
     def output(self) -> bytes:
         """Take the bytes that are to be sent by now; must be called often."""
@@ -399,7 +399,7 @@ class D46:
             if axis.stopped_at_stop() or self._hits_obstacle(axis):
                 self._send(f"!{axis.letter}")
         self._run_task()
-        self._work()
+        self._process_input()
 
     def _hits_obstacle(self, axis: UnitAxis) -> bool:
         if "limit-hit" not in self.faults or not (speed := axis.plant.speed()):
@@ -421,7 +421,7 @@ class D46:
                     return
                 self._send(printed)
 
-    def _work(self) -> None:
+    def _process_input(self) -> None:
         """Process the characters in the buffer, unless the unit is busy."""
         while self._input and self._task is None:
             self._character(self._input.popleft())

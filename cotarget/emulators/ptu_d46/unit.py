@@ -26,86 +26,50 @@ Range = tuple[int, int]
 
 @dataclass(frozen=True)
 class Wording:
-    """Replies that the sources word differently; ``{axis}`` becomes Pan or Tilt, ``{n}`` a number.
+    """Replies that the sources word differently; ``{axis}`` becomes Pan or Tilt, ``{n}`` a number."""
 
-    Attributes:
-        offset: reply to the query of an axis' desired position.
-        speed: reply to the query of its desired speed.
-        acceleration: reply to the query of its acceleration.
-        resolution: reply to the query of its resolution.
-        too_fast: refusal of a speed above the upper bound.
-        illegal: refusal of an invalid command.
-        out_of_range: refusal of any other number.
-        uncalibrated: refusal of a move before the reset; None if the limits of 0 refuse it.
-        independent: reply to the query of the control mode, verbose and terse.
-        velocity: the same in pure velocity mode.
-        regular: terse word for regular power.
-    """
-
-    offset: str = "Current {axis} position is {n}"
-    speed: str = "Target {axis} speed is {n} positions/sec"
-    acceleration: str = "{axis} acceleration is {n} positions/sec^2"
-    resolution: str = "{n} seconds arc per position"
-    too_fast: str = "{axis} speed cannot exceed {n} positions/sec"
-    illegal: str = "Illegal argument"
-    out_of_range: str = "Illegal argument"
-    uncalibrated: str | None = None
+    offset: str = "Current {axis} position is {n}"  # reply to the query of an axis' desired position
+    speed: str = "Target {axis} speed is {n} positions/sec"  # reply to the query of its desired speed
+    acceleration: str = "{axis} acceleration is {n} positions/sec^2"  # reply to the query of its acceleration
+    resolution: str = "{n} seconds arc per position"  # reply to the query of its resolution
+    too_fast: str = "{axis} speed cannot exceed {n} positions/sec"  # refusal of a speed above the upper bound
+    illegal: str = "Illegal argument"  # refusal of an invalid command
+    out_of_range: str = "Illegal argument"  # refusal of any other number
+    uncalibrated: str | None = None  # refusal of a move before the reset; None if the limits of 0 refuse it
+    # Reply to the query of the control mode, verbose and terse.
     independent: tuple[str, str] = ("independent control mode", "independent control mode")
+    # The same in pure velocity mode.
     velocity: tuple[str, str] = ("pure velocity control mode", "pure velocity control mode")
-    regular: str = "REGULAR"
+    regular: str = "REGULAR"  # terse word for regular power
 
 
 @dataclass(frozen=True)
 class UnitProfile:
-    """A model of pan-tilt unit, with the behaviour of its firmware.
+    """A model of pan-tilt unit, with the behaviour of its firmware."""
 
-    Attributes:
-        version: of the firmware; later commands are unknown to it.
-        title: reply to the query of the version.
-        step: resolution of both axes [arc seconds].
-        resolution_digits: decimals of the resolution in replies.
-        pan: lowest and highest pan position that the reset finds [steps].
-        tilt: lowest and highest tilt position that the reset finds [steps].
-        stop_margin: distance from those positions to the mechanical stops [steps].
-        slip: steps lost when an axis meets an obstacle.
-        speed: desired speed at power-up [steps/s].
-        base_speed: speed that an axis reaches without a ramp [steps/s].
-        lowest_speed: lower bound at power-up [steps/s].
-        highest_speed: upper bound at power-up [steps/s].
-        ceiling: highest upper bound that can be set [steps/s].
-        acceleration: at power-up [steps/s^2].
-        reset_speed: speed of the reset [steps/s].
-        tables_s: time to compute the tables after a change of acceleration or a bound [s].
-        boot_s: time from power to readiness, without a reset [s].
-        leading_lf: whether the answer to a command that ends with CR begins with a line feed.
-        reset_at_once: whether RE, RP and RT reset now, rather than set what R and power-up do.
-        halt_waits: whether H answers once the axes stand, rather than at once; the sources do not say.
-        greeting: text for a new TCP client; empty for a plain serial line.
-        wording: of the replies.
-    """
-
-    version: tuple[int, int, int]
-    title: str
-    step: float
-    pan: Range
-    tilt: Range
-    resolution_digits: int = 4
-    stop_margin: int = 30
-    slip: int = 8
-    speed: int = 1000
+    version: tuple[int, int, int]  # of the firmware; later commands are unknown to it
+    title: str  # reply to the query of the version
+    step: float  # resolution of both axes [arc seconds]
+    pan: Range  # lowest and highest pan position that the reset finds [steps]
+    tilt: Range  # lowest and highest tilt position that the reset finds [steps]
+    resolution_digits: int = 4  # decimals of the resolution in replies
+    stop_margin: int = 30  # distance from those positions to the mechanical stops [steps]
+    slip: int = 8  # steps lost when an axis meets an obstacle
+    speed: int = 1000  # desired speed at power-up [steps/s]
+    # Moves up to this speed have no ramp; ramps of faster moves begin at 0 here, and at it on a real unit [steps/s].
     base_speed: int = 1000
-    lowest_speed: int = 31
-    highest_speed: int = 2902
-    ceiling: int = 6000
-    acceleration: int = 2000
-    reset_speed: int = 1000
-    tables_s: float = 3.0
-    boot_s: float = 1.0
-    leading_lf: bool = False
-    reset_at_once: bool = False
-    halt_waits: bool = False
-    greeting: str = ""
-    wording: Wording = Wording()
+    lowest_speed: int = 31  # lower bound at power-up [steps/s]
+    highest_speed: int = 2902  # upper bound at power-up [steps/s]
+    ceiling: int = 6000  # highest upper bound that can be set [steps/s]
+    acceleration: int = 2000  # at power-up [steps/s^2]
+    reset_speed: int = 1000  # speed of the reset [steps/s]
+    tables_s: float = 3.0  # time to compute the tables after a change of acceleration or a bound [s]
+    boot_s: float = 1.0  # time from power to readiness, without a reset [s]
+    leading_lf: bool = False  # whether the answer to a command that ends with CR begins with a line feed
+    reset_at_once: bool = False  # whether RE, RP and RT reset now, rather than set what R and power-up do
+    halt_waits: bool = False  # whether H answers once the axes stand, rather than at once; the sources do not say
+    greeting: str = ""  # text for a new TCP client; empty for a plain serial line
+    wording: Wording = Wording()  # of the replies
 
     @property
     def resolution(self) -> str:
@@ -226,36 +190,10 @@ E_SERIES = UnitProfile(
 
 # Axes
 
-# Stands for "at once": a stepper motor needs no ramp up to its base speed [steps/s^2].
+# Stands for "at once" [steps/s^2].
 INSTANT = 1e6
 # A command that takes time: yields text to print meanwhile, "" for nothing yet, and returns its answer.
 Task = Generator[str, None, str]
-
-
-def plain_acceleration(distance: float, speed: float, base: float, acceleration: float) -> float:
-    """Compute the acceleration of a trapezoid from rest that takes as long as one that begins and ends at a base speed.
-
-    The plant has no base speed; this keeps the duration of its moves.
-
-    Args:
-        distance: of the move [steps].
-        speed: highest speed of the move [steps/s].
-        base: speed reached without a ramp [steps/s].
-        acceleration: above the base speed [steps/s^2].
-    """
-    if base <= 0:
-        return acceleration
-    if speed <= base or distance <= 0:
-        return INSTANT
-    ramps = (speed**2 - base**2) / acceleration  # distance on both ramps
-    if distance >= ramps:
-        duration = 2 * (speed - base) / acceleration + (distance - ramps) / speed
-    else:
-        duration = 2 * (math.sqrt(base**2 + acceleration * distance) - base) / acceleration
-    plain = 4 * distance / duration**2
-    if plain * distance > speed**2:  # its peak would exceed the highest speed
-        plain = speed / (duration - distance / speed)
-    return min(plain, INSTANT)
 
 
 @dataclass
@@ -274,14 +212,7 @@ class UnitAxisSettings:
 
 
 class UnitAxis:
-    """One axis of the unit, as its firmware counts it.
-
-    Args:
-        name: "Pan" or "Tilt".
-        plant: mechanics of the axis, in the unit's steps.
-        unit: profile of the unit.
-        limits: lowest and highest position that a reset finds [steps].
-    """
+    """One axis of the unit, "Pan" or "Tilt", as its firmware counts it; a reset finds its ``limits``."""
 
     def __init__(self, name: str, plant: AxisPlant, unit: UnitProfile, limits: Range) -> None:
         self.name = name
@@ -319,12 +250,12 @@ class UnitAxis:
     def go(self, goal: int, speed: int | None = None) -> None:
         """Move to a position, even during a move; a stop on the way is hit."""
         self._goal, self.pending = goal, None
-        self._set_out(goal, self.settings.speed if speed is None else speed)
+        self._move(goal, self.settings.speed if speed is None else speed)
 
     def change_speed(self) -> None:
         """Continue the present move at the speed that is set now."""
         if self._goal is not None and self.plant.moving():
-            self._set_out(self._goal, self.settings.speed)
+            self._move(self._goal, self.settings.speed)
 
     def drive(self, velocity: int, limits: Range | None) -> None:
         """Turn at a signed speed, up to the limit or, without one, to the stop; 0 halts."""
@@ -339,14 +270,9 @@ class UnitAxis:
 
     def halt(self) -> None:
         """Brake, and drop the goal."""
-        speed, base, acceleration = abs(self.plant.speed()), self.settings.base, float(self.settings.acceleration)
-        if 0 < base < speed:  # gives the braking distance of a motor that stops at its base speed
-            acceleration *= speed**2 / (speed**2 - base**2)
-        elif base >= speed:
-            acceleration = INSTANT if base else acceleration
         self._goal = self.pending = None
         self._into_stop = 0
-        self.plant.halt(min(acceleration, INSTANT))
+        self.plant.halt(self._acceleration(abs(self.plant.speed())))
 
     def stopped_at_stop(self) -> bool:
         """Return whether the present move has just hit its stop, and lose steps there."""
@@ -370,12 +296,12 @@ class UnitAxis:
         """Run into both stops, set the limits from them, and go to 0."""
         self.velocity = self._into_stop = 0
         for stop in self._stops():
-            self._send(stop, self._unit.reset_speed)
+            self._command(stop, self._unit.reset_speed)
             while self.plant.moving():
                 yield ""
             yield f"!{self.letter}"
         self._shift, self._goal, self.pending, self.calibrated = 0, 0, None, True
-        self._send(0, self._unit.reset_speed)
+        self._command(0, self._unit.reset_speed)
         while self.plant.moving():
             yield ""
         return ""
@@ -390,17 +316,19 @@ class UnitAxis:
         margin = self._unit.stop_margin
         return self._limits[0] - margin, self._limits[1] + margin
 
-    def _set_out(self, goal: int, speed: int) -> None:
+    def _move(self, goal: int, speed: int) -> None:
         """Move to a position by the unit's count, or to the stop before it."""
         aim, (lowest, highest) = goal - self._shift, self._stops()
         self._into_stop = (aim > highest) - (aim < lowest)
-        self._send(min(max(aim, lowest), highest), speed)
+        self._command(min(max(aim, lowest), highest), speed)
 
-    def _send(self, aim: int, speed: int) -> None:
+    def _command(self, aim: int, speed: int) -> None:
         """Command the plant to a true position."""
-        settings, distance = self.settings, abs(aim - self.plant.position())
-        acceleration = plain_acceleration(distance, speed, settings.base, settings.acceleration)
-        self.plant.command(aim, speed, acceleration)
+        self.plant.command(aim, speed, self._acceleration(speed))
+
+    def _acceleration(self, speed: float) -> float:
+        """Return the acceleration of a change of speed, which needs no ramp up to the base speed."""
+        return INSTANT if speed <= self.settings.base else self.settings.acceleration
 
 
 # The unit
@@ -414,38 +342,20 @@ class RefusalError(Exception):
 
 @dataclass
 class Settings:
-    """Settings that DS saves, and DR and power-up restore.
+    """Settings that DS saves, and DR and power-up restore."""
 
-    Attributes:
-        pan: of the pan axis.
-        tilt: of the tilt axis.
-        echo: "E" if the unit echoes every character, or "D".
-        feedback: "V" if replies to queries are sentences, "T" for terse ones.
-        limits: "E" for the factory's, "D" for none, "U" for the user's.
-        reset: axes that R and power-up reset: "E" for both, "P", "T", or "D" for none.
-        immediate: whether positions are executed at once, rather than on A or I.
-        network_id: number on a shared line; 0 for a unit that is alone on its line.
-    """
-
-    pan: UnitAxisSettings
-    tilt: UnitAxisSettings
-    echo: str = "E"
-    feedback: str = "V"
-    limits: str = "E"
-    reset: str = "E"
-    immediate: bool = True
-    network_id: int = 0
+    pan: UnitAxisSettings  # of the pan axis
+    tilt: UnitAxisSettings  # of the tilt axis
+    echo: str = "E"  # "E" if the unit echoes every character, or "D"
+    feedback: str = "V"  # "V" if replies to queries are sentences, "T" for terse ones
+    limits: str = "E"  # "E" for the factory's, "D" for none, "U" for the user's
+    reset: str = "E"  # axes that R and power-up reset: "E" for both, "P", "T", or "D" for none
+    immediate: bool = True  # whether positions are executed at once, rather than on A or I
+    network_id: int = 0  # number on a shared line; 0 for a unit that is alone on its line
 
 
 class Unit:
-    """State of a unit, with the operations that several commands use.
-
-    Args:
-        pan: mechanics of pan, in the unit's steps.
-        tilt: mechanics of tilt, in the unit's steps.
-        profile: of the unit.
-        now: returns the unit's time [s].
-    """
+    """State of a unit, with the operations that several commands use."""
 
     def __init__(self, pan: AxisPlant, tilt: AxisPlant, profile: UnitProfile, now: Callable[[], float]) -> None:
         self.profile, self.wording, self.now = profile, profile.wording, now
@@ -528,7 +438,7 @@ class Unit:
             if axis.pending is not None:
                 axis.go(axis.pending)
 
-    def standing(self, *axes: UnitAxis) -> Task:
+    def wait_until_still(self, *axes: UnitAxis) -> Task:
         """Wait until the axes stand."""
         while any(axis.plant.moving() for axis in axes):
             yield ""
@@ -539,7 +449,7 @@ class Unit:
 
         The desired speed is clipped to the bounds.
         """
-        yield from self.standing(axis)
+        yield from self.wait_until_still(axis)
         ready = self.now() + self.profile.tables_s
         while self.now() < ready:
             yield ""
