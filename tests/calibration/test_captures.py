@@ -39,7 +39,7 @@ def test_captures_may_be_in_any_order_beside_unlisted_images(folder):
     index = read_index(folder)
     assert index.board.kind == "charuco"
     assert [capture.t for capture in read_images(folder, index.captures)] == [2.0, 1.0]
-    assert index.captures[0].pan == 0.0
+    assert [(capture.pan, capture.tilt) for capture in index.captures] == [(0.0, 0.0), (0.1, -0.2)]
 
 
 @pytest.mark.parametrize(("rows", "changes", "said"), [

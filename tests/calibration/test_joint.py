@@ -112,6 +112,15 @@ def test_a_view_with_a_wrong_head_pose_is_left_out_and_named(views):
     assert largest_pull(found, Truth()) < PULL
 
 
+def test_a_view_with_many_wrong_corners_is_left_out_as_a_whole(views):
+    off = np.where(np.arange(len(POINTS))[:, None] % 5 < 2, [8.0, -6.0], 0.0)  # two corners of five
+    wrong = replace(views[5], corners_px=views[5].corners_px + off, source="w.png")
+    found = calibrated([*views[:5], wrong, *views[6:]])
+    assert [one.name for one in found.residuals.rejected] == ["w.png"]
+    assert "22 of its 54 corners" in found.residuals.rejected[0].reason
+    assert found.residuals.outliers == 0
+
+
 def test_k3_is_fitted_where_the_fixed_lens_has_it_and_held_otherwise(calibration):
     assert "fixed.k3" not in calibration.covariance.parameters
     assert calibration.fixed.lens.distortion[4] == 0.0

@@ -13,6 +13,7 @@ from cotarget.calibration.calibrate import calibrate
 from cotarget.calibration.captures import INDEX, read_index
 from cotarget.calibration.planning import GRID, Coverage
 from cotarget.calibration.recorder import CaptureRecorder
+from cotarget.calibration.session import learn_fixed, learn_zoom
 from cotarget.config import BoardConfig, parse_config
 from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import pose
@@ -42,6 +43,16 @@ def test_session_calibrates_an_unknown_rig(session):
     # Usual are 0.002 and 0.005 degrees; a mistake of numbering or of order is off by degrees.
     assert np.median(errors) < 0.01
     assert np.percentile(errors, 95) < 0.02
+
+
+def test_the_first_model_of_a_session_is_near_the_truth(session):
+    """Each view of a flat board has two poses; with the wrong one T is turned by tens of degrees."""
+    truth = session[0]
+    recorder = CaptureRecorder(SyntheticRig(truth), BOARD)
+    recorder.start()
+    model = learn_zoom(recorder, learn_fixed(recorder, np.random.default_rng(0)))
+    for found, true in ((model.head.T_zoom0_fixed, truth.gamma), (model.head.T_head_zoom, truth.hand)):
+        assert (found.rotation * true.rotation.inv()).magnitude() < np.radians(5.0)
 
 
 def test_the_plan_covers_both_images_near_and_far(session):
