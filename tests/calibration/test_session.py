@@ -11,9 +11,10 @@ import pytest
 from cotarget import __version__
 from cotarget.calibration.calibrate import calibrate
 from cotarget.calibration.captures import INDEX, read_index
-from cotarget.calibration.planning import GRID, Coverage
+from cotarget.calibration.planning import GRID, Coverage, plan_poses
 from cotarget.calibration.recorder import CaptureRecorder
 from cotarget.calibration.session import learn_fixed, learn_zoom
+from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig, parse_config
 from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import pose
@@ -68,6 +69,21 @@ def test_the_plan_covers_both_images_near_and_far(session):
         widths = [np.ptp(view.corners_px, axis=0).max() for view in views]
         assert max(widths) > 1.8 * min(widths)
     assert calibration.residuals.pairs >= 8
+
+
+def test_planned_head_poses_are_within_the_limits(session):
+    model, T_fixed_board = model_of(session[1]), pose([-0.4, -0.25, 4.0], [0, 0, 0])
+
+    def planned(limits):
+        rng = np.random.default_rng(0)
+        return np.array(plan_poses(model, T_fixed_board, BOARD, Coverage(SIZE), limits, 4, rng, 5.0))
+
+    anywhere = planned(SyntheticRig().limits)
+    assert anywhere.shape == (4, 2)
+    low, high = anywhere.mean(axis=0) - 0.15, anywhere.mean(axis=0) + 0.15
+    narrow = planned(PanTiltLimits((low[0], high[0]), (low[1], high[1]), 2.6, 3.6, 0.0009))
+    assert len(narrow)
+    assert ((narrow >= low) & (narrow <= high)).all()
 
 
 def test_progress_counts_up_to_its_total(session):
