@@ -1,4 +1,4 @@
-"""Captures and photos on disk: what somebody edited, or what lost its images, is refused in one line by name."""
+"""Captures and photos on disk: a malformed index or a missing image is refused in one line with its key."""
 
 import json
 
@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from cotarget.board import draw_board
 from cotarget.calibration import calibrate_captures, calibrate_photos
 from cotarget.calibration.captures import INDEX, pair_photos, read_images, read_index
 from cotarget.config import BoardConfig
@@ -93,3 +94,15 @@ def test_photos_without_pairs_are_refused(tmp_path, names, left, said):
     assert said in str(caught.value)
     with pytest.raises(CalibrationError, match="no such folder"):
         calibrate_photos(tmp_path / "none", left, "right*.png", BoardConfig())
+
+
+def test_images_of_two_boards_are_not_used(tmp_path):
+    board = BoardConfig()
+    large, small = draw_board(board, 40), draw_board(board, 25)
+    both = np.pad(large, ((0, 0), (0, small.shape[1]), (0, 0)), constant_values=255)
+    both[: small.shape[0], large.shape[1] :] = small
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), both)
+    write(tmp_path, [FIXED, ZOOM])
+    with pytest.raises(CalibrationError, match=r"two boards are in this image.* like a\.png"):
+        calibrate_captures(tmp_path)

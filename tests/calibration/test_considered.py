@@ -49,7 +49,7 @@ def test_consider_covariance_only_grows(found):
 
 
 def test_wrong_scales_widen_the_covariance_by_their_error(calibration):
-    """No more than the corners can tell of them: some three ten-thousandths."""
+    """To within what the corners know of the scales, some three ten-thousandths."""
     assert calibration.covariance.sigma("head.pan_scale") == pytest.approx(0.002, abs=0.0012)
     assert calibration.covariance.sigma("head.tilt_scale") == pytest.approx(0.002, abs=0.0012)
     assert calibration.zoom_head.axes.pan_scale == 1.0

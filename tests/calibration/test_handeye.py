@@ -1,4 +1,4 @@
-"""Hand-eye: exact and noisy motions of heads and arms, honest covariances, and motions that must be refused."""
+"""Hand-eye: exact and noisy motions of heads and arms, consistent covariances, and motions that must be refused."""
 
 import cv2
 import numpy as np
@@ -170,7 +170,7 @@ def test_hand_eye_is_no_worse_than_park_and_martin():
     turn, shift = (
         {k: np.sqrt(np.mean(np.square(e)[:, s])) for k, e in errors.items()} for s in (slice(3), slice(3, 6))
     )
-    assert turn["poses"] < turn["closed"] / 2  # the board's place tells the rotation, 4 m away
+    assert turn["poses"] < turn["closed"] / 2  # the board, 4 m away, determines the rotation
     assert shift["poses"] < shift["closed"] / 2
     assert turn["pairs"] < 1.01 * turn["closed"]  # all pairs: the same information with the same weights
     assert shift["pairs"] < 1.01 * shift["closed"]
@@ -340,7 +340,7 @@ def test_motions_too_small_for_their_noise_are_refused():
 
 
 def test_noise_of_the_hand_does_not_pass_for_a_second_axis():
-    """With the hand's own pose noisy, axes scatter and a planar arm looks as if it could tell its height."""
+    """With the hand's own pose noisy, axes scatter, and a planar arm seems to determine its height."""
     rng = np.random.default_rng(12)
     for _ in range(20):
         hands = [noisy(T, rng) for T in PLANAR]

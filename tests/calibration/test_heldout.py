@@ -1,4 +1,4 @@
-"""Captures kept out of the fit: honest where the model is exact, a warning where it is not."""
+"""Captures kept out of the fit: consistent where the model is exact, a warning where it is not."""
 
 from dataclasses import replace
 
@@ -16,8 +16,8 @@ from tests.support.synthetic_rig import fourfold
 RIGS = (Truth(), other_rig())
 BOARDS = 8
 SEEDS, FOLDS = 3, 3  # seeds of each rig
-# Eight placements' misses are two coordinates each, some of them alike: the mean squared, whitened miss of one seed
-# scatters by 0.42 (over a hundred others), that of six by 0.17. Thrice that.
+# Eight placements' misses are two coordinates each, some of them correlated: the mean squared, whitened miss of one
+# seed scatters by 0.42 (over a hundred others), that of six by 0.17. Thrice that.
 RATIO_TOLERANCE = 0.5
 MOST_WIDENED = 1  # of six, where the threshold of three standard deviations is passed by chance once in fifty
 
@@ -115,7 +115,7 @@ def test_too_few_placements_give_no_held_out_check():
     found = fitted(start, views)
     assert cross_validate(found, POINTS, None, folds=5) is None
     assert cross_validate(found, POINTS, None, folds=4) is not None
-    # The fixed camera tells where the board is; without it a placement says nothing of pointing.
+    # Without the fixed camera's view of the board, a placement predicts no pointing.
     half = fitted(start, [v for v in views if v.camera == "zoom" or v.board > 0])
     assert cross_validate(half, POINTS, None, folds=4) is None
     assert cross_validate(half, POINTS, None, folds=3).views == sum(v.camera == "zoom" for v in views if v.board > 0)

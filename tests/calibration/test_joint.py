@@ -1,4 +1,4 @@
-"""The joint method on corners of known truths: what must not matter, and what it must notice or own up to."""
+"""The joint method on corners of known truths: what must not matter, and what it must notice."""
 
 from dataclasses import replace
 
@@ -77,20 +77,20 @@ def test_a_board_turned_by_180_degrees_changes_nothing(views, calibration):
 
 
 WRONG_SHARE, WRONG_PX = 0.01, 10.0
-# A wrong corner is left out, and a hundredth of the corners tells a hundredth of what is known: the parameters move by
+# A wrong corner is left out, and a hundredth of the corners is a hundredth of the information: the parameters move by
 # a tenth of their standard deviation, in a few directions by twice as much.
 SHARE_OF_SIGMA = 0.3
 
 
 def test_single_wrong_corners_are_left_out_and_counted(views, calibration):
     rng = np.random.default_rng(2)
-    planted, spoilt = 0, []
+    planted, changed = 0, []
     for view in views:
         wrong, angle = rng.random(len(POINTS)) < WRONG_SHARE, rng.uniform(0, 2 * np.pi, len(POINTS))
         off = WRONG_PX * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        spoilt.append(replace(view, corners_px=view.corners_px + np.where(wrong[:, None], off, 0.0)))
+        changed.append(replace(view, corners_px=view.corners_px + np.where(wrong[:, None], off, 0.0)))
         planted += int(wrong.sum())
-    found = calibrated(spoilt)
+    found = calibrated(changed)
     assert planted > 10
     assert found.residuals.outliers == planted
     assert found.residuals.rejected == ()
@@ -133,11 +133,11 @@ def test_k3_is_fitted_where_the_fixed_lens_has_it_and_held_otherwise(calibration
 
 JITTER = np.radians(0.03)
 SEEDS = 8
-# Six boards seen four times give 48 angles, which tell their scatter to 11 %, and eight seeds to 4 %: thrice that. Any
-# one seed: thrice 11 %.
+# Six boards seen four times give 48 angles, which determine their scatter to 11 %, and eight seeds to 4 %: thrice that.
+# Any one seed: thrice 11 %.
 JITTER_TOLERANCE, ONE_JITTER_TOLERANCE = 0.12, 0.33
 # The calibration's own error, of two or three directions that matter, is known to a sixth from eight seeds: thrice that
-# is a half. With the jitter in every aim as well, which is the larger part, three times 40 aims tell it to 6 %.
+# is a half. With the jitter in every aim as well, which is the larger part, three times 40 aims determine it to 6 %.
 CALIBRATION_TOLERANCE, AIM_TOLERANCE = 0.5, 0.18
 AIM_SEEDS = 3
 
@@ -166,8 +166,8 @@ def test_an_exact_head_has_no_jitter(calibration):
 
 SCALES = (1.001, 0.999)
 SCALE_SIGMAS = 3.0
-LEAST_TOLD = 0.5  # of the standard deviation that was supposed: the corners must have told most of what is known
-SUPPOSED = 0.002
+LEAST_REDUCTION = 0.5  # of the prior's standard deviation, which the corners must reduce
+PRIOR_SIGMA = 0.002
 
 
 def test_the_encoders_scales_are_found():
@@ -176,7 +176,7 @@ def test_the_encoders_scales_are_found():
     assert {"head.pan_scale", "head.tilt_scale", "head.pan_zero", "head.tilt_zero"} < set(found.covariance.parameters)
     for name, true in zip(("pan_scale", "tilt_scale"), SCALES, strict=True):
         sigma = found.covariance.sigma(f"head.{name}")
-        assert sigma < LEAST_TOLD * SUPPOSED
+        assert sigma < LEAST_REDUCTION * PRIOR_SIGMA
         assert abs(getattr(found.zoom_head.axes, name) - true) < SCALE_SIGMAS * sigma
     measured, predicted = pointing(found, truth)
     assert measured < POINTING_FACTOR * predicted
@@ -200,10 +200,10 @@ def test_cameras_far_apart_that_never_share_a_view_at_home(side):
     assert measured < min(POINTING_FACTOR * predicted, FAR_APART_POINTING)
 
 
-# What the uncertainty says of what pan alone leaves free: that it is of no use.
+# Standard deviations that directions left open by pan alone must exceed.
 USELESS_POSITION, USELESS_TURN = 0.2, np.radians(2.0)
 KNOWN_TURN = np.radians(0.2)
-# What is insisted on is held as loosely as it is of any use, 0.5 m and 5 degrees: a hundred times what corners tell.
+# The prior of regularized directions, 0.5 m and 5 degrees, is a hundred times wider than what corners determine.
 LOOSE_SIGMAS = 0.01
 
 
@@ -224,8 +224,8 @@ def test_pan_alone_is_refused_or_regularized_with_its_uncertainty(views, calibra
 
 
 CUT_SHARE = 0.6  # of the views
-# Three tenths of the corners are gone, and with them a fifth of the precision if they told like any others; half a
-# board tells its pose less well.
+# Three tenths of the corners are gone, and with them a fifth of the precision if all corners counted
+# the same; half a board determines its pose less well.
 CUT_GROWTH = (1.1, 2.0)
 
 

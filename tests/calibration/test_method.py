@@ -158,7 +158,7 @@ def test_an_outlying_view_is_left_out_and_named():
 
 
 def without_a_head(turned):
-    """Pairs of views of ten placements; in the first so many the zoom camera has been turned, and nobody says so."""
+    """Pairs of views of ten placements; in the first ``turned`` ones the zoom camera was turned unreported."""
     truth, rng = Truth(), np.random.default_rng(4)
     views = synthetic_views(truth, POINTS, rng, boards=30, moved=1, pan_range=0.1, tilt_range=0.1)
     pairs = []

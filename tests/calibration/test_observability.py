@@ -56,7 +56,7 @@ def test_boards_facing_the_camera_leave_its_focal_length_open():
 
 
 def test_limits_of_use_scale_with_the_focal_length():
-    """At 7000 px k1 bends the picture so little that nobody misses it."""
+    """At 7000 px k1 hardly bends the image."""
     boards = [
         pose([x, y, z], [a, b, 0])
         for x, y, z, a, b in (

@@ -1,4 +1,4 @@
-"""The outlook of a session: the same predicted error by another route, and what more placements are worth."""
+"""Predicted accuracy of a session, against the calibration's covariance and against views really taken."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def test_predicted_accuracy_is_that_of_the_calibration(found, predicted):
     assert predicted.error() == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=ROUNDING)
 
 
-# Corners of 16 placements tell their noise to 1 %, and where the fit ends up moves the prediction by a few more.
+# Corners of 16 placements determine their noise to 1 %, and where the fit ends up moves the prediction by a few more.
 REAL_TOLERANCE = 0.1
 
 

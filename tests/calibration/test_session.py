@@ -28,14 +28,14 @@ BOARD = BoardConfig()
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """One session with a rolled, toed-in zoom camera, its captures and what was told of its progress."""
+    """One session with a rolled, toed-in zoom camera, its captures and its progress."""
     truth = Truth(gamma=pose([-1.2, 0.1, -0.1], [1.0, 10.0, 40.0]), hand=pose([0.1, -0.15, 0.08], [2.0, 1.5, -38.0]))
     directory = tmp_path_factory.mktemp("captures")
-    told = []
+    progress = []
     calibration = calibrate(
-        SyntheticRig(truth), BOARD, captures_dir=directory, progress=lambda *args: told.append(args), placements=18
+        SyntheticRig(truth), BOARD, captures_dir=directory, progress=lambda *args: progress.append(args), placements=18
     )
-    return truth, calibration, directory, told
+    return truth, calibration, directory, progress
 
 
 def test_session_calibrates_an_unknown_rig(session):
@@ -87,9 +87,9 @@ def test_planned_head_poses_are_within_the_limits(session):
 
 
 def test_progress_counts_up_to_its_total(session):
-    told = session[3]
-    assert told[-1][0] == told[-1][1] == 18
-    assert all(b[0] >= a[0] for a, b in itertools.pairwise(told))
+    progress = session[3]
+    assert progress[-1][0] == progress[-1][1] == 18
+    assert all(b[0] >= a[0] for a, b in itertools.pairwise(progress))
 
 
 def test_index_lists_every_image_at_once(tmp_path):
@@ -137,8 +137,8 @@ NARROW = PanTiltLimits((-0.4, 0.4), (-0.4, 0.4), 2.6, 3.6, 0.0009)
     ({"stuck": True, "truth": Truth()}, "the head stands at"),
     ({"short_of": 0.5}, "the head stands at"),
     ({"frozen_camera": True}, "zoom camera turned"),
-    ({"told": 0.4}, "the zoom lens reports a focal length of 267 px"),
-    ({"told": 3.0}, "the zoom lens reports a focal length of 2001 px"),
+    ({"reported": 0.4}, "the zoom lens reports a focal length of 267 px"),
+    ({"reported": 3.0}, "the zoom lens reports a focal length of 2001 px"),
     ({"truth": Truth(gamma=pose([0, 0, 0], [0, 180, 0])), "limits": NARROW}, "the zoom camera does not see the board"),
     ({"board_config": BoardConfig(corners=(7, 6))}, "the fixed camera does not see the 9x6 board"),
 ])  # fmt: skip
@@ -149,14 +149,14 @@ def test_broken_rig_is_refused_in_one_line(broken, message):
 
 
 def test_wrong_nominal_focal_length_is_corrected():
-    found = calibrate(SyntheticRig(told=478 / 692), BOARD, placements=8)
+    found = calibrate(SyntheticRig(reported=478 / 692), BOARD, placements=8)
     shortest = found.zoom_head.lens.stops[0]
     assert shortest.focal_px[0] == pytest.approx(Truth().zoom.fx, rel=0.01)  # 8 placements know it to 0.2 %
 
 
 @pytest.mark.parametrize("halts", [1, 2, 3])
 def test_a_head_that_was_halted_on_its_way_is_sent_again(halts):
-    """One that tells nobody, and is seen to stand elsewhere."""
+    """The halt raises no error, but the head stands short of its goal."""
     rig = SyntheticRig(halts=halts)
     with pytest.raises(CalibrationError, match="the head stands at") if halts > 2 else contextlib.nullcontext():
         CaptureRecorder(rig, BOARD).turn(0.5, 0.1)
@@ -193,8 +193,8 @@ def test_a_move_that_the_watchdog_halted_is_commanded_again(tmp_path, times):
         CaptureRecorder(made.rig, BOARD, tmp_path).turn(0.5, 0.1)
         assert made.rig.pose == pytest.approx((0.5, 0.1), abs=made.rig.limits.step)
     assert made.sent == [(0.5, 0.1)] * min(times + 1, 3)
-    told = [json.loads(line)["got"] for line in (tmp_path / "commands.jsonl").read_text().splitlines()]
-    assert [got is None for got in told] == [True] * times + [False] * (times < 3)
+    logged = [json.loads(line)["got"] for line in (tmp_path / "commands.jsonl").read_text().splitlines()]
+    assert [got is None for got in logged] == [True] * times + [False] * (times < 3)
 
 
 @pytest.mark.parametrize("error", [EmergencyStopError("emergency stop: a bird"), DeviceError("pan hit its limit")])
@@ -267,7 +267,7 @@ class Interrupted:
         def gone(wish):
             if wish is None:
                 self.log.append("board")
-                raise DeviceError("whoever holds the board is gone")
+                raise DeviceError("the board holder is gone")
             present(wish)
 
         self.rig.fixed.read, self.rig.board.present = interrupted, gone
@@ -289,4 +289,4 @@ def test_an_interrupted_session_halts_the_head_first_and_keeps_its_captures(tmp_
         calibrate(made.rig, BOARD, captures_dir=tmp_path)
     assert made.log == ["halt", "board"]
     assert (tmp_path / INDEX).exists()
-    assert "while the session was broken off: whoever holds the board is gone" in caplog.text
+    assert "while the session was broken off: the board holder is gone" in caplog.text

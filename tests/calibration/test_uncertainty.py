@@ -1,4 +1,4 @@
-"""Covariance of a calibration: honest over many noises, and worked by hand for the line of sight."""
+"""Covariance of a calibration: consistent over many noises, and worked by hand for the line of sight."""
 
 from dataclasses import replace
 

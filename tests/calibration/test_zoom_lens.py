@@ -27,7 +27,7 @@ TARGETS = 40
 # A cubic through four points h apart misses sin(pi s / 2) by up to (pi / 2)^4 h^4 / 24 = 0.003: a hundredth of a
 # percent of the focal length. Corners of 0.05 px on parts of boards of 300 px give two or three hundredths more.
 FOCAL_TOLERANCE = 0.003
-# A dozen placements leave the principal point 0.2 px uncertain (0.017 degrees) and T, with which it goes, likewise.
+# A dozen placements leave the principal point 0.2 px uncertain (0.017 degrees) and so T, which is correlated with it.
 BORESIGHT_TOLERANCE = np.radians(0.04)
 # One seed's error is one draw of some thirty parameters, of which two or three matter: thrice the prediction is beyond
 # chance. The prediction itself is 0.002 to 0.005 degrees, most of it at the wide image's corners, where a dozen

@@ -277,10 +277,10 @@ def test_view_with_corners_on_one_line_is_left_out_of_the_report(plain, caplog):
 
 def test_advice_names_an_uncalibrated_focal_range(plain):
     longest = plain.zoom_head.lens.nominal_px[-1]
-    for factor, told in ((1, False), (3, True)):
+    for factor, named in ((1, False), (3, True)):
         changed = replace(plain, provenance={"focal_range_px": [667.0, factor * longest]})
         said = advice(changed, replace(UNKNOWN, evidence=gather(changed)))
-        assert any("but was calibrated to 667 px" in item for item in said) == told
+        assert any("but was calibrated to 667 px" in item for item in said) == named
 
 
 def test_wavy_board_is_noticed(plain):
@@ -352,8 +352,8 @@ def test_more_placements_do_not_reduce_jitter_or_interpolation_error(plain, stop
     assert what_stays(stops, between) == pytest.approx(doubt, rel=0.01)
     said = f"from {digits(np.degrees(at.rms))} to {digits(np.degrees(with_more_placements(shaky, at)))} degrees"
     assert any(said in item for item in advice(shaky, analyse(shaky)))
-    told = calibration_summary(shaky, Path("c.json"))
-    assert told["predicted_error_deg_with_10_more_placements"] == {
+    summary = calibration_summary(shaky, Path("c.json"))
+    assert summary["predicted_error_deg_with_10_more_placements"] == {
         "667 px": pytest.approx(np.degrees(with_more_placements(shaky, at)))
     }
 

@@ -114,7 +114,7 @@ class SyntheticRig:
     short_of: float = 0.0
     halts: int = 0
     optics: Callable[[float], Stop] | None = None
-    told: float = 1.0  # focal length that the lens reports, over its nominal one
+    reported: float = 1.0  # focal length that the lens reports, over its nominal one
     limits: PanTiltLimits = field(
         default_factory=lambda: PanTiltLimits(
             (np.radians(-159), np.radians(159)), (np.radians(-47), np.radians(31)), 2.6, 3.6, np.radians(0.0514286)
@@ -188,20 +188,20 @@ class _Zoom(_Camera):
 
     @property
     def focal_range(self):
-        shortest = NOMINAL_PX * self.rig.told
+        shortest = NOMINAL_PX * self.rig.reported
         return shortest, shortest * (1 if self.rig.optics is None else FOURFOLD)
 
     def zoom(self, focal_px):
         rig = self.rig
-        wanted = float(np.clip(focal_px, *self.focal_range)) / rig.told
+        wanted = float(np.clip(focal_px, *self.focal_range)) / rig.reported
         if wanted != rig.focal_px:
             rig.focal_px, rig.lens_arrives = wanted, rig.t + ZOOM_TIME
             if wanted not in rig.rays:
                 rig.rays[wanted] = pixel_rays(rig.true_now().zoom)
-        return wanted * rig.told
+        return wanted * rig.reported
 
     def state(self):
-        return ZoomState(self.rig.focal_px * self.rig.told, self.rig.t < self.rig.lens_arrives, self.rig.t)
+        return ZoomState(self.rig.focal_px * self.rig.reported, self.rig.t < self.rig.lens_arrives, self.rig.t)
 
     def capture(self):
         return self.read(self.rig.t)
