@@ -1,11 +1,10 @@
-"""Behaviour of `cotarget follow` when a device fails: each fault of the emulators, while the head turns.
+"""Behaviour of `cotarget follow` at each fault of the emulators, while the head turns.
 
-A book moves in a round, so that a head that follows never stands. A fault is switched on at a random moment, in two
-ways. In the first it passes: it is switched off after a while, and the head should follow again. In the second it is
-held: the head should stand, or go on following where the fault allows that. Everything is judged from outside: by the
-head's true pose from the emulator, by the book's true direction, and by how the command ends. If the line to the head
-is unplugged, no halt can reach the unit. It ends at the goal of its last command; the time and the angle until then are
-reported.
+A book moves on an ellipse, so that a head that follows it never stands. A fault is switched on at a random moment, in
+two ways. In the first it passes: it is switched off after a while, and the head should follow again. In the second it
+is held: the head should stand, or follow where the fault allows that. The results are judged by the head's true pose
+from the emulator, by the book's true direction, and by how the command ends. If the line to the head is unplugged, no
+halt can reach the unit, which ends at the goal of its last command.
 """
 
 import functools
@@ -32,7 +31,7 @@ from cotarget.targeting import Reach, aim
 from experiments.engine import Row
 from experiments.wire.rig import MOUNT, exact_calibration, load
 
-# The book's round: x and z about the fixed camera's axis, at a distance [m], and its period [s].
+# The book's ellipse: x and z about the fixed camera's axis, at a distance [m], and its period [s].
 ROUND, DISTANCE, HEIGHT, PERIOD_S, KNOTS = (1.2, 0.6), 6.0, 1.6, 6.0, 8
 ROUNDS = 150  # number of rounds, longer than one emulator is used
 PAN_DEG, TILT_DEG = (-25.0, 25.0), (-20.0, 20.0)  # soft limits, with a margin around the round as the head sees it
@@ -109,17 +108,8 @@ class Follower:
     def __init__(self, folder: Path, emulated: EmulatedRig) -> None:
         calibration = folder / "calibration.json"
         save_calibration(calibration, exact_calibration(emulated.sim))
-        command = [
-            sys.executable,
-            "-m",
-            "cotarget.cli",
-            "follow",
-            "--rig",
-            str(emulated.rig_toml()),
-            "--target",
-            "book",
-        ]
-        command += ["--calibration", str(calibration), "--seconds", "600"]
+        options = ["--rig", str(emulated.rig_toml()), "--calibration", str(calibration), "--seconds", "600"]
+        command = [sys.executable, "-m", "cotarget.cli", "follow", "--target", "book", *options]
         self._errors: IO[str] = (folder / "follow.log").open("w+", encoding="utf-8")
         self.process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._errors, text=True
@@ -208,12 +198,8 @@ def _try(folder: Path, emulated: EmulatedRig, fault: str, rng: np.random.Generat
                 way = ways.pop(0)
                 if not _follows(watch, follower):
                     said = follower.said()
-                    yield {
-                        "way": way,
-                        "outcome": "did not start",
-                        "traceback": int("Traceback" in said),
-                        "words": _last(said),
-                    }
+                    failed = {"way": way, "outcome": "did not start", "traceback": int("Traceback" in said)}
+                    yield failed | {"words": _last(said)}
                     break
                 watch.until(time.monotonic() + rng.uniform(*MOMENT_S))
                 try:

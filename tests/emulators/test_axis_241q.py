@@ -4,6 +4,7 @@ import re
 import socket
 import threading
 import time
+from dataclasses import replace
 from email.message import Message
 
 import cv2
@@ -133,6 +134,7 @@ def test_the_digest_of_the_rfc_is_allowed():
     )
     assert not allowed(RFC_GUARD, RFC_DIGEST, method="POST")
     assert not allowed(RFC_GUARD, RFC_DIGEST, target="/secret")
+    assert not allowed(replace(RFC_GUARD, nonce="0"), RFC_DIGEST)
 
 
 @pytest.mark.parametrize(

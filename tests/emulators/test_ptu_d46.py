@@ -163,6 +163,7 @@ DIALOGUES = {
         ("A ", "*|", 2.5),
         ("PP TP ", "* 750|* 30|"),
     ],
+    "offsets are from the present position": [("PP1000 ", "*|"), (0.5, ""), ("PO100 PO ", "*|* 600|")],
     "speed offsets are from the present speed": [
         ("PS800 PP3000 ", "*|*|"),
         (0.5, ""),
@@ -219,6 +220,7 @@ DIALOGUES = {
         (0.1, ""),
         ("TP PO TO ", "* 300|* 200|* 300|"),
         ("A ", "*|", 0.0),
+        ("S PP900 H A PO ", "*|*|*|*|* 200|"),  # a position that waits is dropped
     ],
     "slaved positions wait for await or immediate": [  # the example in the manual
         ("S PP1500 TP-900 PP TP ", "*|*|*|* 0|* 0|"),
