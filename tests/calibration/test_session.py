@@ -20,16 +20,19 @@ from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, H
 from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits
 from experiments.calibration.synthetic.aims import pointing_errors
-from experiments.calibration.synthetic.rig import SIZE, Truth
+from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
 from tests.support.synthetic_rig import SyntheticRig
 
 BOARD = BoardConfig()
 
 
+ROLLED = Truth(gamma=pose([-1.2, 0.1, -0.1], [1.0, 10.0, 40.0]), hand=pose([0.1, -0.15, 0.08], [2.0, 1.5, -38.0]))
+
+
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """One session with a rolled, toed-in zoom camera, its captures and its progress."""
-    truth = Truth(gamma=pose([-1.2, 0.1, -0.1], [1.0, 10.0, 40.0]), hand=pose([0.1, -0.15, 0.08], [2.0, 1.5, -38.0]))
+    truth = ROLLED
     directory = tmp_path_factory.mktemp("captures")
     progress = []
     calibration = calibrate(
@@ -46,14 +49,25 @@ def test_session_calibrates_an_unknown_rig(session):
     assert np.percentile(errors, 95) < 0.02
 
 
-def test_the_first_model_of_a_session_is_near_the_truth(session):
+NEAR = np.radians(12.0)  # unknown distortion turns the first T by up to 8 degrees, the wrong pose of a board by tens
+
+
+@pytest.mark.parametrize("truth", [
+    ROLLED,
+    # The board is first seen at the edge of the zoom image, where the unknown distortion bends it.
+    Truth(
+        gamma=pose([1.342, -0.244, 0.088], [-11.23, 12.68, -14.47]),
+        hand=pose([0.114, 0.025, -0.015], [-3.08, -0.18, 15.43]),
+        zoom=Lens(692.0, 693.0, 326.0, 235.0, (-0.25, 0.0, 0.0, 0.0, 0.0)),
+    ),
+], ids=["rolled", "aside"])  # fmt: skip
+def test_the_first_model_of_a_session_is_near_the_truth(truth):
     """Each view of a flat board has two poses; with the wrong one T is turned by tens of degrees."""
-    truth = session[0]
-    recorder = CaptureRecorder(SyntheticRig(truth), BOARD)
+    recorder = CaptureRecorder(SyntheticRig(truth, seed=6), BOARD)
     recorder.start()
-    model = learn_zoom(recorder, learn_fixed(recorder, np.random.default_rng(0)))
+    model = learn_zoom(recorder, learn_fixed(recorder, np.random.default_rng(6)))
     for found, true in ((model.head.T_zoom0_fixed, truth.gamma), (model.head.T_head_zoom, truth.hand)):
-        assert (found.rotation * true.rotation.inv()).magnitude() < np.radians(5.0)
+        assert (found.rotation * true.rotation.inv()).magnitude() < NEAR
 
 
 def test_the_plan_covers_both_images_near_and_far(session):
