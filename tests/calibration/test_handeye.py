@@ -176,6 +176,20 @@ def test_hand_eye_is_no_worse_than_park_and_martin():
     assert shift["pairs"] < 1.01 * shift["closed"]
 
 
+# Over 75 draws the ratio scatters by 0.1; eight poses leave the covariance a fifth too large. Without the degrees of
+# freedom that the parameters take, it would be 1.5.
+FEW_POSES_RATIO = (0.5, 1.15)
+
+
+def test_covariance_from_few_poses_counts_the_degrees_of_freedom():
+    hands = arm(np.random.default_rng(20), 8)
+    solve = from_poses(hands)
+    found = [solve(np.random.default_rng([seed, 2])) for seed in range(75)]
+    measured = np.mean([error_of(one.X) ** 2 for one in found], axis=0)
+    predicted = np.mean([np.diag(one.covariance) for one in found], axis=0)
+    assert FEW_POSES_RATIO[0] < np.mean(measured / predicted) < FEW_POSES_RATIO[1]
+
+
 @pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="OpenCV 5 has no calibrateHandEye")
 def test_hand_eye_is_no_worse_than_opencv():
     rng = np.random.default_rng(1)
