@@ -21,7 +21,14 @@ from cotarget.control.zoom import is_seen_well, shape_of
 from cotarget.detection import Detection
 from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
 from cotarget.estimation.motion_model import PAN, TILT, K, L
-from cotarget.estimation.zoom_matching import CloseupFinder, Expected, Finder, MatchingSettings, ZoomMeasurement
+from cotarget.estimation.zoom_matching import (
+    GATE,
+    CloseupFinder,
+    Expected,
+    Finder,
+    MatchingSettings,
+    ZoomMeasurement,
+)
 from cotarget.geometry import Array
 from cotarget.pantilt import towards
 from cotarget.rig import Frame, Image, PanTiltState, ZoomState
@@ -66,17 +73,18 @@ class StateHistory:
 
     def at(self, t: float) -> Pose | None:
         """Interpolate head and lens to time t [s]; None if t is not between two kept states."""
-        if not (_spans(self._heads, t) and _spans(self._lenses, t)):
+        if not all(kept and kept[0][0] <= t <= kept[-1][0] for kept in (self._heads, self._lenses)):
             return None
-        near = _around(self._heads, t)
-        weights, slopes = _cubic(near[:, 0], t)
-        pan, tilt = weights @ near[:, 1:]
-        lens = _around(self._lenses, t)
-        nominal = math.exp(float(np.interp(t, lens[:, 0], lens[:, 1])))
-        return Pose(float(pan), float(tilt), nominal, float(np.hypot(*(slopes @ near[:, 1:]))))
+        heads, lenses = _around(self._heads, t), _around(self._lenses, t)
+        # Coefficients of the polynomial through the head's states, by powers of the time since t.
+        powers = np.vander(heads[:, 0] - t, increasing=True)
+        (pan, tilt), *higher = np.linalg.solve(powers, heads[:, 1:]).tolist()
+        speed = math.hypot(*higher[0]) if higher else 0.0
+        return Pose(pan, tilt, math.exp(float(np.interp(t, lenses[:, 0], lenses[:, 1]))), speed)
 
 
 def _append(kept: "deque[tuple[float, ...]]", state: tuple[float, ...]) -> None:
+    """Append a state with its time; replace the last one if that came too soon after the one before it."""
     if kept and state[0] <= kept[-1][0]:
         return
     if len(kept) > 1 and kept[-1][0] - kept[-2][0] < SPACING_S:
@@ -86,10 +94,6 @@ def _append(kept: "deque[tuple[float, ...]]", state: tuple[float, ...]) -> None:
         kept.popleft()
 
 
-def _spans(kept: "deque[tuple[float, ...]]", t: float) -> bool:
-    return bool(kept) and kept[0][0] <= t <= kept[-1][0]
-
-
 def _around(kept: "deque[tuple[float, ...]]", t: float) -> Array:
     """Return the at most `POINTS` states nearest to a time, as rows."""
     after = bisect_right(kept, t, key=lambda state: state[0])
@@ -97,24 +101,6 @@ def _around(kept: "deque[tuple[float, ...]]", t: float) -> Array:
     return np.array([kept[i] for i in range(first, min(first + POINTS, len(kept)))])
 
 
-def _cubic(times: Array, t: float) -> tuple[Array, Array]:
-    """Weights of values at given times for the value at t and for its derivative (Lagrange), (n,) each."""
-    n = len(times)
-    weights, slopes = np.ones(n), np.zeros(n)
-    for k in range(n):
-        others = [j for j in range(n) if j != k]
-        for j in others:
-            weights[k] *= (t - times[j]) / (times[k] - times[j])
-            product = 1.0 / (times[k] - times[j])
-            for i in others:
-                if i != j:
-                    product *= (t - times[i]) / (times[k] - times[i])
-            slopes[k] += product
-    return weights, slopes
-
-
-# Most zoom frames that wait for a fixed frame of their time; beyond it the oldest are dropped.
-MOST_WAITING = 30
 MakeFinder = Callable[[Calibration, TargetProfile], Finder]
 
 
@@ -128,14 +114,10 @@ class FusionSettings:
         contradicted: a size or head bias beyond this many prior standard deviations is taken as wrong; a right one
             comes to 1 or 2.
         unfound_s: a target that both cameras should see and that the zoom image does not show for this long is
-            elsewhere [s]. A bird at the right place was missed for 0.8 s at most, a person or a book for a frame or
-            two.
-        unconfirmed_s: a target not shown for this long is unconfirmed, because the widened search has not found it
-            either [s]. With a nominal size three times too large it was found after 2.2 s.
-        inflated_size: standard deviation by which the search is widened after ``unfound_s``, of the logarithm of size
-            and depth together; a nominal size twice too large is 0.7.
-        inflated_bias: standard deviation by which it is widened, of the head's bias [rad].
-        near: a registration within this many standard deviations of the expected place agrees with the estimate.
+            elsewhere [s]: the search is widened. After twice that time the target is unconfirmed. Measured times to
+            find it: docs/design-notes.md.
+        inflated_size: standard deviation by which the search is widened, of the logarithm of size and depth together;
+            a nominal size twice too large is 0.7.
         just_seen_s: longest time since the last measurement for which a target still counts as seen [s].
     """
 
@@ -143,73 +125,18 @@ class FusionSettings:
     time_sigma_s: float = 2e-3
     contradicted: float = 4.0
     unfound_s: float = 1.5
-    unconfirmed_s: float = 3.0
     inflated_size: float = 0.4
-    inflated_bias: float = 5e-3
-    near: float = 3.0
     just_seen_s: float = 0.2
-
-
-class TrackFilters:
-    """One target filter for each of the most important tracks."""
-
-    def __init__(self, calibration: Calibration, target: TargetProfile, settings: FilterSettings, most: int) -> None:
-        """Create no filter yet.
-
-        Args:
-            calibration: calibration of the rig, for the streams in use.
-            target: profile of the target to follow.
-            settings: settings of the filters.
-            most: most tracks with a filter.
-        """
-        self._make = partial(TargetFilter, calibration, target, settings)
-        self._most = most
-        self._filters: dict[int, TargetFilter] = {}
-
-    def keep(self, tracks: Sequence[Track], followed: int | None, favoured: Collection[int]) -> list[Track]:
-        """Select the tracks that have a filter, and drop the filters of all others.
-
-        Args:
-            tracks: tracks after a frame, the oldest first.
-            followed: id of the followed track.
-            favoured: ids of tracks that get a filter before others.
-
-        Returns:
-            The most important tracks, the followed one first.
-        """
-
-        def last(track: Track) -> tuple[bool, ...]:
-            return (
-                track.id != followed,
-                track.id not in favoured,
-                not track.confirmed,
-                track.id not in self._filters,  # a new track must not displace a filter in use
-            )
-
-        kept = sorted(tracks, key=last)[: self._most]
-        numbers = {track.id for track in kept}
-        self._filters = {number: each for number, each in self._filters.items() if number in numbers}
-        return kept
-
-    def get(self, number: int) -> TargetFilter | None:
-        """Return the filter of a track; None if it has none."""
-        return self._filters.get(number)
-
-    def make(self, number: int) -> TargetFilter:
-        """Return the filter of a track, a new one if it has none."""
-        if number not in self._filters:
-            self._filters[number] = self._make()
-        return self._filters[number]
 
 
 @dataclass(frozen=True)
 class FixedMeasurement:
-    """What one frame of the fixed camera measures of a track, see `TargetFilter.update_fixed`.
+    """Measurement of a track by one frame of the fixed camera, for `TargetFilter.update_fixed`.
 
     Attributes:
         box: bounding box; the size of a clipped one is only a lower bound.
         sigma_px: standard deviation of its centre, (2,) [px]; None for that of the settings.
-        size_px: the known dimension [px], if it is better known than from this box alone.
+        size_px: size of the known dimension [px], if it is better known than from this box alone.
     """
 
     box: Measurement
@@ -239,21 +166,25 @@ class ZoomSearch:
 
     Attributes:
         finder: registers the target; a new one for each followed track.
-        waiting: zoom frames without a fixed frame of their time.
+        waiting: zoom frames without a fixed frame of their time, the oldest first.
         unfound_s: time for which the zoom image should have shown the target and did not [s].
         apart_s: time of the newest zoom frame less that of the newest fixed frame [s].
     """
 
-    def __init__(self, make_finder: Callable[[], Finder], settings: FusionSettings, latest_s: float) -> None:
+    def __init__(
+        self, make_finder: Callable[[], Finder], settings: FusionSettings, bias_sigma: float, latest_s: float
+    ) -> None:
         """Create a search without a target.
 
         Args:
             make_finder: makes the finder for a target.
             settings: settings of the fusion.
+            bias_sigma: standard deviation of the head's bias by which the search is widened [rad].
             latest_s: largest delay of one camera's frames against the other's [s].
         """
         self._make_finder, self._settings, self._latest_s = make_finder, settings, latest_s
-        self.waiting: deque[Frame] = deque(maxlen=MOST_WAITING)
+        self._bias_sigma = bias_sigma
+        self.waiting: deque[Frame] = deque()
         self._zoom_t = math.inf
         self.apart_s = 0.0
         self.start()
@@ -265,11 +196,9 @@ class ZoomSearch:
     def add(self, frame: Frame, fixed_t: float) -> None:
         """Add a zoom frame; fixed_t is the time of the newest fixed frame [s]."""
         self.waiting.append(frame)
+        while self.waiting[0].t < frame.t - self._latest_s:
+            self.waiting.popleft()
         self.apart_s = frame.t - fixed_t
-
-    def clear(self) -> None:
-        """Drop the frames that wait."""
-        self.waiting.clear()
 
     def next_frame(self, fixed_t: float) -> Frame | None:
         """Return the newest zoom frame for which the fixed camera has shown the target; drop it and older ones.
@@ -294,13 +223,13 @@ class ZoomSearch:
         seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
         if seen is None:
             return None
-        # With a wrong size or calibration the search would look beside the target for ever, so it is widened.
-        wider = None
+        # With a wrong size or calibration the gate would never contain the target, so it is widened.
+        searched = seen
         if self.is_overdue:
-            wider = _inflated(estimate, self._settings).appearance(pose.pan, pose.tilt, pose.nominal_px)
+            wider = _inflated(estimate, self._settings.inflated_size, self._bias_sigma)
+            searched = wider.appearance(pose.pan, pose.tilt, pose.nominal_px) or seen
         pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
-        covariance = (seen if wider is None else wider).covariance
-        found = self.finder.find(frame, Expected(estimate.x_fixed, covariance, pan, tilt, pose.nominal_px))
+        found = self.finder.find(frame, Expected(estimate.x_fixed, searched.covariance, pan, tilt, pose.nominal_px))
         self._count_unfound(frame, found, seen, estimate)
         return found
 
@@ -312,7 +241,7 @@ class ZoomSearch:
     @property
     def is_unconfirmed(self) -> bool:
         """Whether the zoom image has failed to show the target even to the widened search."""
-        return self.unfound_s > self._settings.unconfirmed_s
+        return self.unfound_s > 2 * self._settings.unfound_s
 
     def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
         """Count the time for which the zoom image should have shown the target and did not."""
@@ -321,7 +250,7 @@ class ZoomSearch:
         if found is not None:
             innovation = found.center_px - (size - 1) / 2 - seen.offset_px
             S = seen.covariance + np.diag(np.square(found.sigma_px) + np.square(found.body_sigma_px))
-            if float(innovation @ np.linalg.solve(S, innovation)) <= self._settings.near**2:
+            if float(innovation @ np.linalg.solve(S, innovation)) <= GATE:
                 self.unfound_s = 0.0
                 return
         is_inside = np.all(np.abs(seen.offset_px) + seen.size_px / 2 <= size / 2)
@@ -364,13 +293,16 @@ class TargetFusion:
         make_finder = finder or partial(CloseupFinder, settings=matching)
         self._latest_s = matching.latest_s
         self._filter_settings = filter or filter_settings(target, calibration)
-        self._filters = TrackFilters(calibration, target, self._filter_settings, settings.most_filters)
+        self._make_filter = partial(TargetFilter, calibration, target, self._filter_settings)
+        self._filters: dict[int, TargetFilter] = {}  # of the most important tracks
         self._followed: int | None = None
         self._seen_well_s: dict[int, float] = {}  # time for which each track was seen well in the close-up [s]
         self._unlikely: set[int] = set()  # tracks whose size or pointing contradicts the priors
         self._T_base_fixed = calibration.zoom_head.T_base_fixed
         self.states = StateHistory()
-        self.search = ZoomSearch(partial(make_finder, calibration, target), settings, matching.latest_s)
+        self.search = ZoomSearch(
+            partial(make_finder, calibration, target), settings, self._filter_settings.bias_inflation, matching.latest_s
+        )
 
     def follow(self, number: int | None) -> None:
         """Register another track in the zoom image from now on; None for no track."""
@@ -392,7 +324,9 @@ class TargetFusion:
         numbers = {track.id for track in tracks}
         self._seen_well_s = {number: seconds for number, seconds in self._seen_well_s.items() if number in numbers}
         self._unlikely &= numbers
-        for track in self._filters.keep(tracks, self._followed, favoured):
+        kept = self._most_important(tracks, favoured)
+        self._filters = {track.id: self._filters.get(track.id) or self._make_filter() for track in kept}
+        for track in kept:
             if track.missed:
                 continue
             measured = measure(track, self._target)
@@ -401,9 +335,22 @@ class TargetFusion:
                 if fixed_view is not None:  # the same body point that the zoom image measures
                     body = replace(measured.box, center_px=fixed_view.body_px)
                     measured = replace(measured, box=body, sigma_px=fixed_view.body_sigma_px)
-            self._filters.make(track.id).update_fixed(
+            self._filters[track.id].update_fixed(
                 measured.box, frame.t, sigma_px=measured.sigma_px, size_px=measured.size_px
             )
+
+    def _most_important(self, tracks: Sequence[Track], favoured: Collection[int]) -> list[Track]:
+        """Select the tracks that have a filter, the followed one first."""
+
+        def last(track: Track) -> tuple[bool, ...]:
+            return (
+                track.id != self._followed,
+                track.id not in favoured,
+                not track.confirmed,
+                track.id not in self._filters,  # a new track must not displace a filter in use
+            )
+
+        return sorted(tracks, key=last)[: self._settings.most_filters]
 
     def update_zoom(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
         """Register the followed target in the zoom image and update its filter.
@@ -419,7 +366,7 @@ class TargetFusion:
         if frame is not None:
             self.search.add(frame, fixed_t)
         if self._followed is None:
-            self.search.clear()
+            self.search.waiting.clear()
             return None
         due = self.search.next_frame(fixed_t)
         known = self._filters.get(self._followed)
@@ -515,9 +462,9 @@ def _contradictions(estimate: Estimate, settings: FusionSettings) -> list[str]:
     return wrong
 
 
-def _inflated(estimate: Estimate, settings: FusionSettings) -> Estimate:
+def _inflated(estimate: Estimate, size_sigma: float, bias_sigma: float) -> Estimate:
     """Widen the covariance of size and head bias; the ratio of size to depth, which the fixed camera sees, stays."""
     P = estimate.state_covariance.copy()
-    P[np.ix_([L, K], [L, K])] += settings.inflated_size**2
-    P[[PAN, TILT], [PAN, TILT]] += settings.inflated_bias**2
+    P[np.ix_([L, K], [L, K])] += size_sigma**2
+    P[[PAN, TILT], [PAN, TILT]] += bias_sigma**2
     return replace(estimate, state_covariance=P)

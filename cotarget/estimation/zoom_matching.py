@@ -23,8 +23,8 @@ from cotarget.rig import Frame, Image
 
 # Gate on squared distances in standard deviations.
 GATE = 3.0**2
-# Standard deviation of the body's centre along u and v, in parts of the box's sides, by the target profile's matcher:
-# measured on simulated targets. It is that of the box itself (None) where the outline is not known.
+# Standard deviation of the body's centre along u and v, in parts of the box's sides, by the target profile's matcher;
+# None where the outline is not known. Measured on simulated targets.
 BODY_SIGMA = {"box": (0.01, 0.01), "upright": (0.03, 0.006), "outline": (0.05, 0.12), None: (0.08, 0.18)}
 # Step for derivatives, in parts of the depth.
 STEP = 1e-3
@@ -177,12 +177,7 @@ def _body(
 ) -> tuple[Array, Array]:
     """Locate the centre of the body in a box; return it and its standard deviation, (2,) [px] each.
 
-    Args:
-        target: target profile; its matcher decides.
-        center: centre of the box (u, v), (2,) [px].
-        size: width and height of the box, (2,) [px].
-        pixels: u of the patch's columns and v of its rows [px].
-        outline: whether each pixel of the patch is the target's, (h, w); None if that is not known.
+    `pixels` are u of the patch's columns and v of its rows; `outline`, (h, w), is None where it is not known.
     """
     known = target.matcher == "box" or outline is not None
     sigma = np.array(BODY_SIGMA[target.matcher if known else None]) * size
@@ -279,13 +274,7 @@ def _search(
 ) -> Place | None:
     """Find the place of highest correlation with a cut-out sampled every ``pitch`` fixed pixels.
 
-    Args:
-        image: zoom image, (H, W, 3) BGR.
-        fixed_view: the target in the fixed image.
-        view: mapping from the fixed to the zoom image; the search is around its centre.
-        pitch: distance of samples [px of the fixed image].
-        reach: samples to each side in which the maximum is; None for those inside the gate.
-        settings: settings of the registration.
+    The search covers ``reach`` samples to each side of the view's centre, or all samples inside the gate if it is None.
     """
     template, weight, middle = fixed_view.at_pitch(pitch)
     step = view.J * pitch  # zoom pixels per sample

@@ -1,4 +1,4 @@
-"""Weighted normalised correlation against its definition, and samples against ramps."""
+"""Weighted normalised correlation against its definition, and resampling against ramps."""
 
 import math
 
@@ -9,7 +9,7 @@ from cotarget.estimation.correlation import correlate, resample, summit
 
 
 def naive(image, inside, template, weight, row, column):
-    """Correlation and visible part by their definition: weighted covariances of the samples inside, all colours."""
+    """Compute correlation and visible part by definition: weighted covariances of the samples inside, all colours."""
     h, w = weight.shape
     here = weight * inside[row : row + h, column : column + w]
     n = here.sum()
@@ -21,7 +21,7 @@ def naive(image, inside, template, weight, row, column):
 
 
 @pytest.mark.parametrize("cut", [False, True])
-def test_correlation_is_that_of_its_definition(cut):
+def test_correlation_follows_its_definition(cut):
     rng = np.random.default_rng(3)
     image, template = rng.normal(5, 2, (21, 24, 3)).astype(np.float32), rng.normal(3, 1, (7, 9, 3)).astype(np.float32)
     weight = rng.uniform(0, 1, (7, 9)).astype(np.float32)
@@ -34,18 +34,18 @@ def test_correlation_is_that_of_its_definition(cut):
         assert (scores[at], seen[at]) == pytest.approx(expected, abs=1e-4)  # float32
 
 
-def test_a_maximum_is_that_of_a_parabola():
+def test_a_summit_is_that_of_a_parabola():
     v, u = np.mgrid[0:9, 0:11]
     score = 1 - 0.02 * (u - 4.3) ** 2 - 0.03 * (v - 5.2) ** 2
     assert summit(score, (5, 4)) == pytest.approx([4.3, 5.2])
     assert summit(score, (4, 5)) == pytest.approx([4.3, 5.2])  # a neighbour leads to it
     assert summit(score, (0, 4)) is None
-    assert summit(score, (2, 8)) is None  # it goes on rising
+    assert summit(score, (2, 8)) is None  # the score still rises at the border
 
 
 @pytest.mark.parametrize("pitch", [0.3, 1.0, 1.7, 4.0, 11.3])
-def test_samples_are_taken_where_the_map_says(pitch):
-    """A ramp is its own mean, whatever is averaged: each sample is the coordinate where it is taken."""
+def test_samples_are_taken_at_the_mapped_pixels(pitch):
+    """Averaging leaves a ramp as it is, so each sample is the coordinate where it is taken."""
     v, u = np.mgrid[0:480, 0:640].astype(np.float32)
     A = np.array([[pitch, 0.1 * pitch, 150.3], [-0.1 * pitch, pitch, 140.8]])
     for plane, row in ((u, 0), (v, 1)):
@@ -56,5 +56,5 @@ def test_samples_are_taken_where_the_map_says(pitch):
         assert np.abs(samples - (A[row, 0] * i + A[row, 1] * j + A[row, 2])).max() < max(pitch, 1.0) / 16
     left = 3.2 * pitch
     _, inside = resample(u, np.array([[pitch, 0.0, -left], [0.0, pitch, 100.0]]), (20, 17))
-    there = pitch * np.arange(20) - left >= -0.5  # a pixel reaches half a one to each side
+    there = pitch * np.arange(20) - left >= -0.5  # a pixel is half a pixel wide to each side
     assert (inside == there).all()

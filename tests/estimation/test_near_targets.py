@@ -1,4 +1,4 @@
-"""Targets whose box the border cuts, because they come near and stay: no size measures their depth for minutes."""
+"""Targets that come near and stay, so that the image border clips their box and no size measures their depth."""
 
 import math
 from dataclasses import replace
@@ -17,14 +17,14 @@ from tests.support.rigs import rig_of
 
 RATE = 15.0
 LAST = np.array(SIZE) - 0.5  # right and lower edge of the image [px]
-# Where it begins, where it stops [m], and its width over its height; each is cut where it stops.
+# Depth at the start and at the stop [m], and width over height; each target is clipped where it stops.
 WAYS = {"person": (8.0, 2.0, 0.26), "bird": (9.0, 0.6, 1.0), "book": (3.0, 0.2, 0.7)}
 SIDE_PX = 1.0  # noise of each edge
 ROUNDING = 1e-9
 
 
 class Approach:
-    """Comes straight on from the side at a speed and stops; as a detector it gives the part that is in the image."""
+    """Target that approaches at a constant speed and stops, and the detector of its part inside the image."""
 
     mask = None
 
@@ -36,7 +36,7 @@ class Approach:
 
     def path(self, t):
         z = max(self.start - self.speed * max(t - self.waits_s, 0.0), self.stop)
-        aside = 0.6 * math.sin(2 * t) if t < self.waits_s else 0.0  # or nobody would believe that it moves
+        aside = 0.6 * math.sin(2 * t) if t < self.waits_s else 0.0  # so that it is confirmed as moving
         return np.array([0.05 * self.start + aside, 0.02 * self.start, z])
 
     def box(self, lens, t):
@@ -56,7 +56,7 @@ class Approach:
 
 @pytest.mark.parametrize("speed", [0.5, 1.4, 3.0, 10.0])
 @pytest.mark.parametrize("name", WAYS)
-def test_a_target_that_stays_clipped_for_a_minute_is_about_where_it_was_seen_whole(name, speed):
+def test_the_depth_of_a_target_clipped_for_a_minute_stays_bounded(name, speed):
     lens, way = Truth().fixed, Approach(name, speed)
     estimator = TargetFilter(calibration_of(Truth()), way.target)
     arrived = way.waits_s + (way.start - way.stop) / speed
@@ -73,21 +73,21 @@ def test_a_target_that_stays_clipped_for_a_minute_is_about_where_it_was_seen_who
             depths.append(found.depth)
             sigmas.append(sigma[2])
     side = way.box(lens, arrived + 60.0).size_px[0 if way.target.dimension == "width" else 1]
-    farthest = lens.fy * way.target.size / side  # where it would be if that were the whole of it
+    farthest = lens.fy * way.target.size / side  # if the visible part were all of it
     late = depths[len(depths) // 6 :]
     assert 0.5 * way.target.size - ROUNDING < min(depths)
-    if name != "bird":  # of a bird that is 40 % narrower than its wings are wide the same box says 40 % less
+    if name != "bird":  # the same box of a bird with folded wings is 40 % nearer
         assert max(late) < 1.1 * farthest
-    assert max(late) < 1.5 * min(late)  # it stands, and so does the estimate
-    assert max(sigmas) < 1.5 + ROUNDING  # a factor of five, and no more
+    assert max(late) < 1.5 * min(late)  # the target stands
+    assert max(sigmas) < 1.5 + ROUNDING  # a factor of five
 
 
-USUAL_SPEED = 0.1  # relative; what a frame adds and takes away leaves 4 %
+USUAL_SPEED = 0.1  # relative; one frame's noise and correction leave 4 %
 
 
 @pytest.mark.parametrize("name", WAYS)
-def test_a_velocity_along_the_axis_that_no_size_measures_returns_to_its_prior(name):
-    """The target has been seen in part for five seconds."""
+def test_an_unmeasured_velocity_along_the_axis_returns_to_its_prior(name):
+    """The target is clipped for five seconds."""
     calibration, target = calibration_of(Truth()), DEFAULT_TARGETS[name]
     estimator = TargetFilter(calibration, target)
     box = Detection(np.array(calibration.fixed.lens.image_center_px), np.array([60.0, 80.0]), 1.0)
@@ -112,16 +112,16 @@ def test_a_clipped_box_is_an_upper_bound_of_the_depth():
     depth = Truth().fixed.fy * person.size / 120.0
     assert found[0.3] == pytest.approx(depth, rel=0.01)
     assert found[0.9] == found[0.3]
-    assert 0.9 * depth / 1.4 < found[1.4] < 1.01 * depth / 1.4  # it comes on a little, as it was seen to have come
+    assert 0.9 * depth / 1.4 < found[1.4] < 1.01 * depth / 1.4  # its measured approach goes on for a little
     estimator = TargetFilter(calibration, person)
     estimator.update_fixed(replace(whole, size_px=whole.size_px / 3, clipped=True), 0.0)
-    assert estimator.at(0.0).state_covariance[2, 2] > 0.9**2  # alone, it says next to nothing
+    assert estimator.at(0.0).state_covariance[2, 2] > 0.9**2  # alone, it measures next to nothing
     estimator.update_fixed(whole, 1 / RATE)
     found = estimator.at(1 / RATE)
     assert abs(math.log(found.depth / depth)) < 4 * math.sqrt(found.state_covariance[2, 2]) < 0.5
 
 
-def test_a_target_that_flies_at_the_camera_stays_before_it():
+def test_a_target_that_flies_at_the_camera_keeps_a_positive_depth():
     calibration = calibration_of(Truth())
     estimator, near = TargetFilter(calibration, DEFAULT_TARGETS["bird"]), calibration.fixed.lens.image_center_px
     for i in range(30):  # from 30 m to 1 m in two seconds
@@ -135,7 +135,7 @@ SEEN = State.FOLLOWING, State.UNCONFIRMED  # the formula rig's zoom images show 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [1.0, 1.4])
-def test_the_head_stands_before_a_person_who_has_come_close(speed):
+def test_the_head_stands_still_for_a_person_who_stands_close(speed):
     way, rig = Approach("person", speed, waits_s=3.0), FormulaRig()
     poses = []
     for step in follow(rig_of(rig), CALIBRATION, way.target, way, seconds=25.0):
@@ -143,7 +143,7 @@ def test_the_head_stands_before_a_person_who_has_come_close(speed):
         assert step.state in (*SEEN, State.SEARCHING)
     t, pan, tilt = np.array(poses).T
     assert step.state in SEEN
-    cut = t > way.waits_s + (way.start - 2.6) / speed  # from 2.6 m on its feet are out of view
+    cut = t > way.waits_s + (way.start - 2.6) / speed  # nearer than 2.6 m its feet are out of view
     for angle in (pan, tilt):
         assert np.ptp(angle[cut]) < math.radians(12)
         assert np.ptp(angle[t > 18.0]) < math.radians(2)

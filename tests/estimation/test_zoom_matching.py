@@ -24,8 +24,8 @@ SIZE = (640, 480)
 FINE = 8  # scenes are drawn with this many bits of sub-pixel, and antialiased
 FOCAL, CENTER, DISTORTION = 690.0, (319.5, 239.5), np.array([-0.2, 0.0, 0.0, 0.0])
 BASELINE = 0.4  # [m]
-SIGMA_PX = 20.0  # of where the target is expected in the zoom image: that is 2 m of 10 in depth at 700 px
-OUTLINE_OFF = 0.25  # relative, of an outline's sides by its pixels in the fixed image: one of some 18, and blur
+SIGMA_PX = 20.0  # of the expected place in the zoom image: 2 m of 10 m in depth at 700 px
+OUTLINE_OFF = 0.25  # relative error of an outline's sides: one of 18 px in the fixed image, and blur
 REGISTERED_PX = 0.25  # of the fixed image: a sixtieth of the smallest target below
 BIRD = DEFAULT_TARGETS["bird"]
 # A bird with a wing up, seen from the side, in metres about its middle.
@@ -50,12 +50,12 @@ def matrix(focal):
 
 
 def turned(pan, tilt):
-    """The camera's orientation in its frame at home: to the right by pan, then up by tilt."""
+    """Orientation of the camera in its frame at home: to the right by pan, then up by tilt."""
     return cv2.Rodrigues(np.array([0.0, pan, 0.0]))[0] @ cv2.Rodrigues(np.array([tilt, 0.0, 0.0]))[0]
 
 
 class Scene:
-    """Birds before a sky with clouds, as both cameras see them, each with clouds of its own as if by parallax."""
+    """Birds before a cloudy sky in both images, with different clouds in each as if by parallax."""
 
     def __init__(self, birds, nominal=3000.0, roll_deg=0.0, aim_off_px=(0.0, 0.0), seed=0, colour=(45, 50, 55)):
         self.rng = np.random.default_rng(seed)
@@ -76,7 +76,7 @@ class Scene:
         return cv2.projectPoints(x, np.zeros(3), np.zeros(3), matrix(self.nominal), None)[0][:, 0]
 
     def draw(self, project, magnified, which=None):
-        """Sky, clouds, birds, then noise of 2 grey levels and JPEG of quality 90."""
+        """Draw sky, clouds and birds, then add noise of 2 grey levels and JPEG of quality 90."""
         clouds = self.rng.normal(0, 1, (12, 16)).astype(np.float32)
         clouds = np.clip(cv2.resize(clouds, SIZE, interpolation=cv2.INTER_CUBIC), -1, 1)[..., None]
         image = np.array([215.0, 180.0, 140.0]) + clouds * [20.0, 35.0, 50.0]
@@ -91,7 +91,7 @@ class Scene:
         return cv2.imdecode(cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
 
     def fixed(self, t=0.0):
-        """Frame, detection and foreground of the first bird."""
+        """Return frame, detection and foreground of the first bird."""
         corners = self.fixed_px(self.birds[0] + np.column_stack([OUTLINE, np.zeros(len(OUTLINE))]))
         low, high = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0))
         mask = np.zeros(SIZE[::-1], np.uint8)
@@ -102,7 +102,7 @@ class Scene:
         return Frame(self.draw(self.zoom_px, self.nominal / FOCAL, which), t)
 
     def expected(self, off_px=(0.0, 0.0), sigma_px=SIGMA_PX):
-        """Off by so much in the zoom image."""
+        """Return the expected position, wrong by `off_px` in the zoom image."""
         depth = self.birds[0][2]
         x = self.birds[0] + np.array([*off_px, 0.0]) * depth / self.nominal
         return Expected(x, sigma_px**2 * np.eye(2), self.pan, self.tilt, self.nominal)
@@ -113,7 +113,7 @@ class Scene:
         return finder
 
     def error(self, found, finder=None):
-        """Distance of the point that was found from the one that the fixed image shows, in its pixels."""
+        """Distance of the found point from that of the fixed image [px of the fixed image]."""
         body_px = (self.finder() if finder is None else finder).fixed_view_at(0.0).body_px
         ray = np.append(cv2.undistortPoints(body_px.reshape(1, 1, 2), matrix(FOCAL), DISTORTION)[0, 0], 1.0)
         there = self.zoom_px(ray * self.birds[0][2])[0]
@@ -122,33 +122,33 @@ class Scene:
 
 @pytest.mark.parametrize("nominal", [700.0, 1800.0, 4000.0, 7500.0])
 @pytest.mark.parametrize("roll_deg", [0.0, 8.0])
-def test_the_same_point_is_found_in_both_images(nominal, roll_deg):
+def test_a_target_is_registered_at_any_focal_length_and_roll(nominal, roll_deg):
     scene = Scene([(1.5, -1.0, 20.0)], nominal, roll_deg)
     found = scene.finder().find(scene.zoom(), scene.expected((15.0, -10.0)))
     assert found is not None
     error = scene.error(found)
     assert error < REGISTERED_PX
     assert error < 4 * found.sigma_px * FOCAL / nominal
-    # A bird's middle may be off by what a wing moves it, which is not the registration's fault.
+    # A wing moves the body's centre, which is no error of the registration.
     assert (found.body_sigma_px > found.sigma_px / 4).all()
     assert found.seen == pytest.approx(1.0)
     assert found.size_px == pytest.approx(np.array([0.52, 0.4]) * nominal / 20.0, rel=OUTLINE_OFF)
 
 
-def test_a_bird_that_is_not_there_is_not_found():
+def test_nothing_is_found_in_an_empty_zoom_image():
     for seed in range(8):
         scene = Scene([(1.5, -1.0, 20.0)], seed=seed)
         assert scene.finder().find(scene.zoom(which=[]), scene.expected()) is None
 
 
-def test_a_bird_outside_the_gate_is_not_found():
+def test_a_target_outside_the_gate_is_not_found():
     scene = Scene([(1.5, -1.0, 20.0)])
     finder, zoom = scene.finder(), scene.zoom()
     assert finder.find(zoom, scene.expected((100.0, 0.0), sigma_px=10.0)) is None
     assert finder.find(zoom, scene.expected((100.0, 0.0), sigma_px=40.0)) is not None
 
 
-def test_of_two_alike_in_the_gate_neither_is_sure():
+def test_two_equal_targets_in_the_gate_are_ambiguous():
     scene = Scene([(1.5, -1.0, 20.0), (2.1, -1.0, 20.0)])  # 0.6 m at 20 m and 3000 px: 90 px
     finder, zoom = scene.finder(), scene.zoom()
     halfway = scene.expected((45.0, 0.0), sigma_px=40.0)
@@ -158,7 +158,7 @@ def test_of_two_alike_in_the_gate_neither_is_sure():
     assert scene.error(sure) < REGISTERED_PX
 
 
-def test_one_that_the_border_cuts_is_found_as_long_as_most_of_it_shows():
+def test_a_target_clipped_by_the_zoom_image_is_found_while_most_of_it_shows():
     for off, found_there in ((0.0, True), (300.0, True), (-290.0, True), (360.0, False), (420.0, False)):
         scene = Scene([(1.5, -1.0, 20.0)], aim_off_px=(off, 0.0))
         found = scene.finder().find(scene.zoom(), scene.expected((10.0, 5.0)))
@@ -168,7 +168,7 @@ def test_one_that_the_border_cuts_is_found_as_long_as_most_of_it_shows():
             assert (found.seen < 0.98) == (off != 0)
 
 
-def test_a_stream_of_half_the_size():
+def test_a_zoom_stream_of_half_the_size_is_registered():
     scene = Scene([(1.5, -1.0, 20.0)])
     half = Frame(cv2.resize(scene.zoom().image, (320, 240), interpolation=cv2.INTER_AREA), 0.0)
     finder = CloseupFinder(scene.calibration.for_streams(SIZE, (320, 240)), BIRD)
@@ -180,7 +180,7 @@ def test_a_stream_of_half_the_size():
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.5, 0.0), (0.5, 90.0), (1.15, -20.0)])
-def test_the_two_cameras_need_not_be_exposed_alike(gain, offset):
+def test_the_cameras_may_be_exposed_differently(gain, offset):
     scene = Scene([(1.5, -1.0, 20.0)])
     image = np.clip(scene.zoom().image * gain + offset, 0, 255).astype(np.uint8)
     found = scene.finder().find(Frame(image, 0.0), scene.expected())
@@ -188,7 +188,7 @@ def test_the_two_cameras_need_not_be_exposed_alike(gain, offset):
     assert scene.error(found) < REGISTERED_PX
 
 
-def test_the_sight_nearest_in_time_counts_and_an_old_one_does_not():
+def test_the_fixed_frame_nearest_in_time_is_registered_and_an_old_one_is_not():
     scene = Scene([(1.5, -1.0, 20.0)])
     frame, detection, mask = scene.fixed()
     finder = CloseupFinder(scene.calibration, BIRD)
@@ -202,7 +202,7 @@ def test_the_sight_nearest_in_time_counts_and_an_old_one_does_not():
     assert finder.find(Frame(zoom.image, 1.2), scene.expected()) is None
 
 
-def test_without_a_foreground_the_box_does():
+def test_a_target_without_foreground_is_registered_by_its_box():
     scene = Scene([(1.5, -1.0, 20.0)])
     frame, detection, mask = scene.fixed()
     for nothing in (None, np.zeros_like(mask)):
@@ -213,7 +213,7 @@ def test_without_a_foreground_the_box_does():
         assert scene.error(found, finder) < REGISTERED_PX
 
 
-def test_a_box_that_the_wide_view_s_border_cuts_says_little_of_the_body():
+def test_a_clipped_box_has_an_uncertain_body_centre():
     scene = Scene([(1.5, -1.0, 20.0)])
     frame, detection, mask = scene.fixed()
     sigmas = []
@@ -226,14 +226,14 @@ def test_a_box_that_the_wide_view_s_border_cuts_says_little_of_the_body():
 
 
 @pytest.mark.parametrize("x", [(0.0, 0.0, -20.0), (0.0, 0.0, 0.0), (math.nan, 0.0, 20.0), (90.0, 0.0, 20.0)])
-def test_what_cannot_be_seen_is_not_found(x):
+def test_a_target_that_a_camera_cannot_show_is_not_found(x):
     scene = Scene([(1.5, -1.0, 20.0)])
     expected = dataclasses.replace(scene.expected(), x_fixed=np.array(x))
     assert scene.finder().find(scene.zoom(), expected) is None
 
 
 @pytest.mark.parametrize("center", [(-30.0, 100.0), (700.0, 100.0), (math.nan, 100.0), (0.0, 0.0), (639.0, 479.0)])
-def test_boxes_at_and_beyond_the_border_do_no_harm(center):
+def test_boxes_at_and_beyond_the_border_are_not_registered(center):
     scene = Scene([(1.5, -1.0, 20.0)])
     frame, detection, mask = scene.fixed()
     finder = CloseupFinder(scene.calibration, BIRD)
@@ -243,13 +243,13 @@ def test_boxes_at_and_beyond_the_border_do_no_harm(center):
 
 # ---------------------------------------------------------------- rendered scenes
 
-# Registration in rendered scenes [px of the wide view]: a person's is 2 px coarse, and limbs are seen from elsewhere.
+# Registration error in rendered scenes [px of the fixed image]: the cameras see a person's limbs from two sides.
 RENDERED_PX = {"book": 0.3, "person": 1.2, "bird": 0.4}
 
 
 @pytest.mark.render
 @pytest.mark.parametrize("name", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("book", "person")), "bird"])
-def test_rendered_targets_are_found_from_the_shortest_focal_length_to_the_longest(name):
+def test_rendered_targets_are_registered_from_the_shortest_focal_length_to_the_longest(name):
     config = sim_config(SCENES[name], (name,), 5)
     world, empty = (
         SimWorld(config),
@@ -269,19 +269,19 @@ def test_rendered_targets_are_found_from_the_shortest_focal_length_to_the_longes
         rig.head.move(there.pan, there.tilt)
         for each in (world, empty):
             each.rig.clock.sleep_until(t + config.sim.fixed.latency_s + 0.001)
-        wide, nothing, zoom = rig.fixed.read(), empty.rig.fixed.read(), rig.zoom.read()
-        assert wide.t == zoom.t == pytest.approx(t)
-        mask = (np.abs(wide.image.astype(int) - nothing.image).max(axis=2) > 25).astype(np.uint8)
+        fixed, nothing, zoom = rig.fixed.read(), empty.rig.fixed.read(), rig.zoom.read()
+        assert fixed.t == zoom.t == pytest.approx(t)
+        mask = (np.abs(fixed.image.astype(int) - nothing.image).max(axis=2) > 25).astype(np.uint8)
         outline = truth.silhouette(name, "fixed", t)
         box = Detection((outline.low_px + outline.high_px) / 2, outline.size_px, 0.9)
-        sight = finder.update_fixed(wide, box, mask)
-        # As if the depth were known to a twentieth, by which it is wrong.
+        fixed_view = finder.update_fixed(fixed, box, mask)
+        # The expected depth is wrong by a twentieth.
         head, lens = truth.head_at(t), truth.nominal_at(t)
         found = finder.find(zoom, Expected(x_fixed * 1.05, 30.0**2 * np.eye(2), *head, lens))
         assert found is not None, f"at {nominal:.0f} px"
         scale = float(np.mean(found.size_px / box.size_px))
         error = (found.center_px - truth.pixel("zoom", truth.center(name, t), t)) / scale
-        body = sight.body_px - truth.pixel("fixed", truth.center(name, t), t)
+        body = fixed_view.body_px - truth.pixel("fixed", truth.center(name, t), t)
         off = float(np.linalg.norm(error - body))
         assert off < RENDERED_PX[name]
         assert (np.abs(error) * scale < 4 * found.body_sigma_px + 4 * found.sigma_px).all()
@@ -289,8 +289,8 @@ def test_rendered_targets_are_found_from_the_shortest_focal_length_to_the_longes
     empty.close()
 
 
-def test_a_box_beyond_the_frame_shows_nothing_though_its_surroundings_do():
-    """As a detector of one's own may give; what it holds would be no pixel, and its likeness to anything no number."""
+def test_a_box_beyond_the_frame_has_no_fixed_view_though_its_margin_is_inside():
+    """A user's detector may return such a box; without a pixel its correlation would be nan."""
     frame = Frame(np.full((480, 640, 3), 128, np.uint8), 0.0)
     assert look(frame, Detection(np.array([90.8, 485.4]), np.array([0.9, 8.3]), 1.0), None, BIRD) is None
     assert look(frame, Detection(np.array([90.8, 483.0]), np.array([0.9, 8.3]), 1.0), None, BIRD) is not None

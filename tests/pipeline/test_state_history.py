@@ -1,4 +1,4 @@
-"""Head and lens in between the states that their devices told, against the head's own profile."""
+"""Interpolated states of head and lens against the head's trapezoidal profile."""
 
 import math
 
@@ -10,7 +10,7 @@ from cotarget.rig import PanTiltState, ZoomState
 from cotarget.sim.motion import trapezoid
 
 RATE_S = 0.04
-OFF_DEG = 0.024  # where the acceleration changes between two states
+OFF_DEG = 0.024  # largest error of the cubic, where the acceleration changes between two states
 
 
 def filled(pan, until=1.2, lens=lambda t: 1000.0, phase=0.0):
@@ -34,25 +34,25 @@ def profile(goal_deg):
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.013, 0.031])
-def test_a_move_of_the_head_is_followed_between_its_states(phase):
+def test_pan_tilt_and_speed_are_interpolated_along_a_move(phase):
     pan = profile(20.0)
     history = filled(pan, phase=phase)
     for t in np.arange(0.0, 0.95, 0.005):
         found = history.at(t)
         assert math.degrees(abs(found.pan - pan(t))) < OFF_DEG
         assert found.tilt == -found.pan
-    # Half way, after sqrt(20 / 206) s, it is as fast as it gets: 206 times that, on both axes.
+    # It is fastest half way, after sqrt(20 / 206) s: 206 times that, on both axes.
     fastest = history.at(0.1 + math.sqrt(20 / 206))
     assert math.degrees(fastest.speed) == pytest.approx(math.sqrt(2) * 206 * math.sqrt(20 / 206), rel=0.1)
     assert history.at(0.99).speed == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_lens_moves_evenly_in_the_logarithm():
+def test_the_logarithm_of_the_focal_length_is_interpolated_linearly():
     history = filled(lambda t: 0.0, lens=lambda t: 1000.0 * math.exp(t))
     assert history.at(0.513).nominal_px == pytest.approx(1000.0 * math.exp(0.513))
 
 
-def test_what_was_not_told_is_not_known():
+def test_only_times_between_two_kept_states_have_a_pose():
     history = StateHistory()
     assert history.at(0.0) is None
     history.add(PanTiltState(0.1, 0.2, False, 5.0), ZoomState(700.0, False, 5.0))
@@ -67,7 +67,7 @@ def test_what_was_not_told_is_not_known():
 
 
 @pytest.mark.parametrize("apart", [1e-4, 1e-3, 2e-3])
-def test_states_that_come_in_pairs_do_not_multiply_their_rounding(apart):
+def test_states_in_close_pairs_do_not_multiply_their_rounding(apart):
     step, rate = math.radians(0.0514286), math.radians(30.0)
     history = StateHistory()
     for k in range(40):
@@ -77,10 +77,10 @@ def test_states_that_come_in_pairs_do_not_multiply_their_rounding(apart):
     times = np.arange(0.5, 1.4, 0.003)
     off = [history.at(t).pan - rate * t for t in times]
     assert np.sqrt(np.mean(np.square(off))) < 0.5 * step
-    assert history.at(39 * RATE_S + apart) is not None  # the newest one counts
+    assert history.at(39 * RATE_S + apart) is not None  # the newest state is kept
 
 
-def test_states_that_come_fast_are_kept_evenly():
+def test_states_that_come_fast_are_interpolated_too():
     history = StateHistory()
     for t in np.arange(0.0, 1.0, 0.002):
         history.add(PanTiltState(math.sin(t), 0.0, True, t), ZoomState(1000.0, False, t))

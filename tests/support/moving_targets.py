@@ -1,6 +1,6 @@
-"""Targets that move, and what a synthetic rig measures of them: boxes in the wide view, middles in the zoom view.
+"""Moving targets and their measurements by a synthetic rig: boxes in the fixed image, centres in the zoom image.
 
-Nothing here uses the package's camera or head model: everything comes from `experiments.calibration.synthetic`.
+The camera and head models are those of `experiments.calibration.synthetic`, independent of the package's.
 """
 
 import math
@@ -19,10 +19,10 @@ from experiments.calibration.synthetic.aims import aimed
 from experiments.calibration.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Truth
 
 RATE = 25.0
-APART = 0.013  # the zoom camera's frames come that much after the wide one's [s]
+APART = 0.013  # delay of the zoom camera's frames after the fixed camera's [s]
 STEP = math.radians(0.0514286)
 KNOTS = 0.02  # between a path's knots [s]
-# Noise of a box's middle, [px] and as a fraction of its sides; of its sides, likewise; of the middle in the zoom view.
+# Standard deviations: of a box's centre and sides, [px] and in parts of the side; of the centre in the zoom image [px].
 NOISE = {"book": (0.2, 0.01), "person": (0.4, 0.04), "bird": (0.4, 0.06)}
 SIDE_NOISE = {"book": (0.3, 0.01), "person": (1.0, 0.03), "bird": (1.0, 0.03)}
 ZOOM_NOISE = {"book": 0.5, "person": 6.0, "bird": 4.0}
@@ -32,7 +32,7 @@ BEAT_HZ = 4.0
 
 
 def calibration_of(truth, **more):
-    """The calibration that is exactly true, of a lens that only magnifies."""
+    """Return the exact calibration of a rig whose zoom lens only magnifies."""
 
     def intrinsics(lens):
         return Intrinsics(SIZE, (lens.fx, lens.fy), (lens.cx, lens.cy), lens.distortion)
@@ -50,13 +50,13 @@ def calibration_of(truth, **more):
 
 
 def magnified(truth, nominal_px):
-    """The zoom lens at a nominal focal length."""
+    """Return the zoom lens at a nominal focal length."""
     m = nominal_px / NOMINAL_PX
     return replace(truth.zoom, fx=truth.zoom.fx * m, fy=truth.zoom.fy * m)
 
 
 def book_path(rng, seconds):
-    """Stands at 10 m, and is put elsewhere within 0.8 s, half way through."""
+    """Stand at 10 m; half way through, move to another place within 0.8 s."""
     t = np.arange(0, seconds, KNOTS)
     here = np.array([rng.uniform(-1, 1), rng.uniform(-0.3, 0.3), rng.uniform(9, 11)])
     away = np.array([rng.choice([-1, 1]) * rng.uniform(0.5, 1), rng.uniform(-0.3, 0.3), rng.uniform(-0.7, 0.7)])
@@ -65,7 +65,7 @@ def book_path(rng, seconds):
 
 
 def steered(rng, seconds, start, speed, sharpest, lag, keep, every):
-    """Go at a constant speed towards places drawn anew, turning no more sharply than so many rad/m, (n, 2)."""
+    """Go at a constant speed towards random places, with a bounded curvature [rad/m]; return the path, (n, 2)."""
     p, heading, curvature, goal, way = np.array(start), rng.uniform(0, 2 * np.pi), 0.0, None, []
     middle, radius = keep
     for _ in np.arange(0, seconds, KNOTS):
@@ -82,14 +82,14 @@ def steered(rng, seconds, start, speed, sharpest, lag, keep, every):
 
 
 def person_path(rng, seconds):
-    """Walks and turns, 8 to 12 m away."""
+    """Walk and turn, 8 to 12 m away."""
     way = steered(rng, seconds, (0.0, 10.0), WALKING, 1.0, 0.3, (np.array([0.0, 10.0]), 1.5), 3.0)
     t = np.arange(0, seconds, KNOTS)
     return CubicSpline(t, np.c_[way[:, 0], np.full(len(t), 0.6), way[:, 1]])
 
 
 def bird_path(rng, seconds):
-    """Flies with turns of at least 10 m radius, some 26 m away."""
+    """Fly with turns of at least 10 m radius, some 26 m away."""
     speed = FLYING * rng.uniform(0.8, 1.2)
     start = (rng.uniform(-3, 3), rng.uniform(23, 29))
     way = steered(rng, seconds, start, speed, 1 / RADIUS, 0.3, (np.array([0.0, 26.0]), 3.5), 3.0)
@@ -104,7 +104,7 @@ SCATTER = {"book": 0.0, "person": 0.04, "bird": 0.15}  # of true sizes; twice th
 
 @dataclass(frozen=True)
 class ZoomView:
-    """What the zoom camera sees of the target, and what head and lens report for that time."""
+    """Measurement of the target in the zoom image, and the reported state of head and lens at its time."""
 
     pixel: np.ndarray
     sigma_px: float
@@ -115,10 +115,10 @@ class ZoomView:
 
 
 class Flight:
-    """One target on its way, and the rig that watches."""
+    """One moving target and its measurements by the rig."""
 
     def __init__(self, name, seed, seconds=8.0, path=None, wrong=1.0, bias=(0.0, 0.0)):
-        """``wrong`` is the true size over the scattered one; ``bias`` how much more the head turns than it says."""
+        """``wrong`` is a factor on the true size; ``bias`` the true angles of the head less the reported ones [rad]."""
         self.rng = np.random.default_rng([seed, len(name)])
         self.name, self.target, self.truth, self.bias = name, DEFAULT_TARGETS[name], Truth(), np.array(bias)
         self.path = path or PATHS[name](self.rng, seconds + 1.0)
@@ -129,7 +129,7 @@ class Flight:
         self._looks = {}
 
     def sides(self, t):
-        """True width and height of its box at unit distance [m]."""
+        """Return the true width and height of the target's box at unit distance [m]."""
         if self.name == "book":
             return self.size, 1.3 * self.size
         if self.name == "person":
@@ -144,11 +144,11 @@ class Flight:
         return self.size * max(across, along), self.size * max(0.5 * abs(np.sin(beat)), 0.15)
 
     def visible(self, t):
-        """Whether the wide view shows it well inside."""
+        """Whether the target is well inside the fixed image."""
         return bool(self.truth.fixed.inside(self.path(t)[None], 15.0)[0])
 
     def wide(self, t):
-        """The detection in the wide view, or None outside of it."""
+        """Return a noisy detection in the fixed image; None outside."""
         if not self.visible(t):
             return None
         x = self.path(t)
@@ -171,7 +171,7 @@ class Flight:
         return aimed(self.truth, self.path(t)[None], np.array([0.0, 0.0, 1.0]))[0]
 
     def zoom(self, t, reported=None, nominal_px=None):
-        """What the zoom camera sees where the head reports some angles, by default about the target; or None."""
+        """Return a noisy measurement in the zoom image at reported angles, or about the target; None outside."""
         x = self.path(t)
         if reported is None:
             reported = np.round((self.aimed(t) + self.rng.normal(0, 0.008, 2)) / STEP) * STEP
@@ -186,7 +186,7 @@ class Flight:
         return ZoomView(pixel, ZOOM_NOISE[self.name], float(reported[0]), float(reported[1]), nominal_px, t)
 
     def miss_percent(self, x_fixed, t):
-        """How far off an estimated position lies in the close-up, in % of its width."""
+        """Return the error of an estimated position in the close-up [% of the width]."""
         at = self.truth.gamma.inv().translation
         a, b = np.asarray(x_fixed) - at, self.path(t) - at
         angle = np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
@@ -194,6 +194,6 @@ class Flight:
         return 100 * np.tan(angle) * focal / SIZE[0]
 
 
-def show(spatial_filter, view):
-    """Give a filter what the zoom camera saw."""
-    return spatial_filter.update_zoom(view.pixel, view.sigma_px, view.pan, view.tilt, view.nominal_px, view.t)
+def show(target_filter, view):
+    """Update a filter with a measurement in the zoom image."""
+    return target_filter.update_zoom(view.pixel, view.sigma_px, view.pan, view.tilt, view.nominal_px, view.t)
