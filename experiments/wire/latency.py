@@ -107,12 +107,12 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
             cameras = {"fixed": NotedCamera(rig.fixed), "zoom": NotedCamera(rig.zoom)}
             noted = replace(rig, **cameras, head=NotedHead(rig.head, notes))  # type: ignore[arg-type]
             found = measure_head(noted, head_seconds)
-            orders = _commands(notes, taps[0], emulated.sim.sim.head.command_delay_s)
+            orders = true_command_delays(notes, taps[0], emulated.sim.sim.head.command_delay_s)
             calibration = exact_calibration(emulated.sim)
             swing, _ = measure_fixed(noted, calibration, config.board, board_seconds)
         truth = {
-            "fixed": _truth(cameras["fixed"], rig.spec.fixed.latency_s, watcher.exposures["fixed"]),
-            "zoom": _truth(cameras["zoom"], rig.spec.zoom.latency_s, watcher.exposures["zoom"]),
+            "fixed": true_latencies(cameras["fixed"], rig.spec.fixed.latency_s, watcher.exposures["fixed"]),
+            "zoom": true_latencies(cameras["zoom"], rig.spec.zoom.latency_s, watcher.exposures["zoom"]),
             "command": orders,
         }
     measured = {
@@ -134,13 +134,13 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
     ]
 
 
-def _truth(camera: NotedCamera, latency_s: float, exposures: Exposures) -> list[float]:
+def true_latencies(camera: NotedCamera, latency_s: float, exposures: Exposures) -> list[float]:
     """Give the true time from exposure to arrival of each frame of a camera [s]."""
     arrived = [t + latency_s for t in sorted(camera.times)]
     return [t - exposures.before(t) for t in arrived]
 
 
-def _commands(notes: Notes, tap: Tap, delay_s: float) -> list[float]:
+def true_command_delays(notes: Notes, tap: Tap, delay_s: float) -> list[float]:
     """Give the true time from each move's call to the motion of its pan [s]."""
     pans = [(t, len(data)) for t, data in tap.written if ORDER.fullmatch(data) and data.startswith(b"PP")]
     found = []

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.wire import age, command, faults, wire
-from experiments.wire.command import Turn
+from experiments.wire import age, command, faults, latency, wire
+from experiments.wire.command import Notes, Turn
 from experiments.wire.figures import bounded, missed, summarise
 from experiments.wire.rig import Tap
 
@@ -33,12 +33,14 @@ def test_the_parts_of_a_command():
     assert row["beyond_s"] == pytest.approx(0.020, abs=CLOSE)
 
 
-def test_a_head_that_stands_and_goes_on():
+def test_rests_of_a_head():
     watch = faults.Watch(None)
     watch.times = [0.1 * i for i in range(12)]
     pan = [0.0, 1.0, 2.0, 2.01, 2.0, 2.0, 2.5, 3.0, 3.0, 3.0, 3.0, 3.0]
     watch.angles = [(angle, -30.0 if i == 3 else 0.0) for i, angle in enumerate(pan)]
     assert watch.beyond() == pytest.approx(30.0 - 20.0)  # the soft limit of tilt
+    watch.angles[3] = (28.0, 0.0)
+    assert watch.beyond() == pytest.approx(28.0 - 25.0)  # of pan
     watch.angles = [(angle, 0.0) for angle in pan]
     assert np.allclose(watch.rests(0.0), [(0.2, 0.5), (0.7, 1.1)])
     assert watch.standing(0.0) == pytest.approx(0.7)
@@ -49,7 +51,23 @@ def test_a_head_that_stands_and_goes_on():
     assert watch.standing(0.0) is None
 
 
-def test_pictures_tell_their_numbers():
+def test_true_latencies_of_frames():
+    """Images exposed at 1.0 and 1.1 and published 0.06 s later; frames arrive 0.05 s after their stated times."""
+    exposures, camera = latency.Exposures(), latency.NotedCamera(None)
+    for exposed, published in ((1.0, 1.06), (1.1, 1.16), (1.1, 1.16)):
+        exposures.add(exposed, published)
+    camera.times = {0.9, 1.03, 1.12}
+    assert latency.true_latencies(camera, 0.05, exposures) == pytest.approx([math.nan, 0.08, 0.07], nan_ok=True)
+
+
+def test_true_delays_of_commands():
+    """The first move's pan is on the wire 0.02 s after the call, in 6 bytes of 1/960 s; the second is not sent."""
+    tap, notes = Tap(None, None), Notes(None, 0.0, [Turn(2.0, 2.0), Turn(5.0, 5.0)])
+    tap.written = [(1.9, b"PP7 "), (2.005, b"PP "), (2.01, b"PS100 "), (2.02, b"PP-96 "), (2.03, b"TP8 ")]
+    assert latency.true_command_delays(notes, tap, 0.04) == pytest.approx([0.02 + 6 / 960 + 0.04])
+
+
+def test_the_number_in_a_picture_can_be_read():
     assert [age.number_of(age.picture(number)) for number in (0, 1, 130, 255)] == [0, 1, 130, 255]
 
 
@@ -75,6 +93,7 @@ def test_figures_from_rows():
     assert summary["figures"]["faults of 2 for which that took longer"]["measured"] == 1
     assert not reached["latency"]
     assert reached["parity"]
+    assert summary["figures"]["parity, farthest apart"]["measured"] == pytest.approx(1.0)
     assert summary["load"] == [0.5, 2.0]
     assert len(missed(summary)) == 4
     assert missed(summarise(rows[:1])) == []
@@ -88,7 +107,7 @@ def test_each_figure_is_a_job(monkeypatch):
     assert wire.one(settings, 1) == [{"figure": "age", "in": True}]
 
 
-def test_where_the_book_is():
+def test_directions_of_the_book():
     """By hand: at 3 s the book is 1.2 m left, 6 m away, as high as the cameras; the zoom camera is 0.4 m right."""
     pan, tilt = faults.directions(3.0)
     assert pan == pytest.approx(-math.degrees(math.atan2(1.2 + 0.4, 6.0)), abs=3.0)
@@ -98,7 +117,7 @@ def test_where_the_book_is():
     assert faults.directions(1.5)[1] - faults.directions(4.5)[1] == pytest.approx(11.4, abs=1.0)
 
 
-def test_a_head_that_strays():
+def test_the_last_time_off_the_book():
     watch = faults.Watch(None)
     watch.times, watch.off = [0.0, 0.1, 0.2, 0.3], [1.0, 9.0, 7.0, 1.0]
     assert watch.strayed(0.05) == 0.2
@@ -120,7 +139,7 @@ def stalled(settled_s, hang=0):
         ([stalled(4.6, hang=1), stalled(0.3)], 4.6),  # no machine explains that
     ],
 )
-def test_what_a_busy_machine_has_spoilt_is_measured_again(monkeypatch, runs, measured):
+def test_figures_disturbed_by_a_busy_machine_are_measured_again(monkeypatch, runs, measured):
     runs = iter(runs)
     monkeypatch.setitem(wire.RUNS, "faults", lambda *_: next(runs))
     settings = replace(SHORT, only=("faults",))
@@ -131,7 +150,7 @@ def test_what_a_busy_machine_has_spoilt_is_measured_again(monkeypatch, runs, mea
 
 @pytest.mark.wire
 @pytest.mark.slow
-def test_polls_are_counted_as_they_go_over_the_line():
+def test_polls_are_counted_on_the_line():
     row = wire.polls.poll_alone((0, 0), 1.0)
     # "PP " and "* 0\r\n", and the same for tilt: 16 bytes, but for what the first and the last pair leave over.
     assert row["bytes"] == pytest.approx(16.0, abs=0.5)
