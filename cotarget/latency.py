@@ -85,7 +85,7 @@ def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
         after = rig.zoom.zoom(shortest if way % 2 else goal)
         frames += _moving_frames(rig, frames)
         count += len(frames)
-        grown = scales([frame.image for frame in frames])
+        grown = log_scales([frame.image for frame in frames])
         reported = math.log(after / before)
         if not abs(grown[-1] - reported) <= AS_REPORTED * abs(reported):
             seen = "shows too little" if math.isnan(grown[-1]) else f"grows {math.exp(grown[-1]):.2f} times"
@@ -94,13 +94,13 @@ def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
                 "something with structure that stands still, all over the picture"
             )
         times = np.array([frame.t for frame in frames]) - late_s
-        delays.append(began(times, grown / grown[-1]) - t)
+        delays.append(start_of_motion(times, grown / grown[-1]) - t)
         before = after
     low, middle, high = np.percentile(delays, (25, 50, 75)).tolist()
     return LensLatency(middle, (high - low) / 2, count)
 
 
-def began(times: Array, part: Array) -> float:
+def start_of_motion(times: Array, part: Array) -> float:
     """Extrapolate the start of a way whose first part is even [s].
 
     Args:
@@ -116,16 +116,16 @@ def began(times: Array, part: Array) -> float:
     return float(np.clip(offset, times[standing] - slope * FIRST, times[standing + 1]))
 
 
-def scales(images: Sequence[Image]) -> Array:
+def log_scales(images: Sequence[Image]) -> Array:
     """Logarithm of each image's scale relative to the first one, (n,); nan from where it is unknown."""
     found = [0.0]
     greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images]
     for one, other in itertools.pairwise(greys):
-        found.append(found[-1] + _scale(one, other))
+        found.append(found[-1] + _log_scale(one, other))
     return np.array(found)
 
 
-def _scale(before: Image, after: Image) -> float:
+def _log_scale(before: Image, after: Image) -> float:
     """Logarithm of the scale between two successive images; nan if too few corners are tracked."""
     corners = cv2.goodFeaturesToTrack(before, CORNERS, WEAKEST, APART_PX)
     if corners is None or len(corners) < FEWEST_CORNERS:
@@ -270,12 +270,12 @@ def _zoom_delay(frames: Sequence[Frame], times: Array, pans: Array) -> Delay:
     """
     t = np.array([frame.t for frame in frames])
     images = [frame.image for frame in frames]
-    whole = delay_between(t, picture_shifts(images), times, pans)
+    whole = delay_between(t, horizontal_shifts(images), times, pans)
     if whole.agreement >= AGREEMENT:
         return whole
     edges = np.linspace(0, images[0].shape[0], BANDS + 1).astype(int)
     bands = [[image[top:bottom] for image in images] for top, bottom in itertools.pairwise(edges)]
-    delays = [delay_between(t, picture_shifts(band), times, pans) for band in bands]
+    delays = [delay_between(t, horizontal_shifts(band), times, pans) for band in bands]
     return max(whole, *delays, key=lambda delay: delay.agreement)
 
 
@@ -326,7 +326,8 @@ def measure_fixed(
     delay = delay_between(t_fixed, u_fixed, t_zoom, u_zoom)
     if delay.agreement < AGREEMENT:
         raise CalibrationError(
-            f"the cameras do not see the board swing alike (correlation {delay.agreement:.2f}); swing it left and right"
+            f"the cameras' views of the swinging board do not agree (correlation {delay.agreement:.2f}); swing "
+            "it left and right"
         )
     return delay, len(t_fixed)
 
@@ -361,7 +362,7 @@ def delay_between(t: Array, values: Array, t_other: Array, other: Array) -> Dela
     return Delay(float(found.x), float(np.sqrt(1.0 - found.fun)))
 
 
-def picture_shifts(images: Sequence[Image]) -> Array:
+def horizontal_shifts(images: Sequence[Image]) -> Array:
     """Horizontal shift of each image against the first one, by phase correlation [px], (n,)."""
     greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32) for image in images]
     window = cv2.createHanningWindow(greys[0].shape[::-1], cv2.CV_32F)

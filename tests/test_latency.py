@@ -11,14 +11,14 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import parse_config
 from cotarget.errors import CalibrationError
 from cotarget.latency import (
-    began,
     command_delay,
     delay_between,
+    horizontal_shifts,
+    log_scales,
     measure_fixed,
     measure_head,
     measure_lens,
-    picture_shifts,
-    scales,
+    start_of_motion,
 )
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame, PanTiltState
@@ -54,7 +54,7 @@ def test_a_shifted_picture_tells_its_shift():
     rng = np.random.default_rng(2)
     scene = cv2.GaussianBlur(rng.uniform(0, 255, (120, 260, 3)).astype(np.uint8), (0, 0), 2)
     images = [np.ascontiguousarray(scene[:, 50 - shift : 210 - shift]) for shift in (0, 3, -12, 20)]
-    np.testing.assert_allclose(picture_shifts(images), [0, 3, -12, 20], rtol=0.01, atol=0.01)
+    np.testing.assert_allclose(horizontal_shifts(images), [0, 3, -12, 20], rtol=0.01, atol=0.01)
 
 
 def test_a_command_is_dated_to_where_its_acceleration_begins():
@@ -193,21 +193,21 @@ def scene():
 def test_a_picture_that_grows_tells_its_scale():
     wanted = np.array([0.0, 0.0, 0.06, 0.12, 0.12, 0.02])
     pictures = [cv2.warpAffine(scene(), cv2.getRotationMatrix2D((160, 120), 0, np.exp(s)), (320, 240)) for s in wanted]
-    np.testing.assert_allclose(scales(pictures), wanted, atol=0.003)
+    np.testing.assert_allclose(log_scales(pictures), wanted, atol=0.003)
 
 
 def test_a_picture_without_structure_tells_nothing():
-    assert np.isnan(scales([np.full((60, 80, 3), 128, np.uint8)] * 3)[1:]).all()
+    assert np.isnan(log_scales([np.full((60, 80, 3), 128, np.uint8)] * 3)[1:]).all()
 
 
 @pytest.mark.parametrize("began_at", [0.5, 0.52, 0.569])
 def test_an_even_way_began_where_it_leads_back_to(began_at):
     times = np.arange(0.0, 1.5, 0.07)
-    assert began(times, np.clip((times - began_at) / 0.4, 0.0, 1.0)) == pytest.approx(began_at, abs=1e-6)
+    assert start_of_motion(times, np.clip((times - began_at) / 0.4, 0.0, 1.0)) == pytest.approx(began_at, abs=1e-6)
 
 
 def test_a_way_between_two_frames_began_between_them():
-    assert began(np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.0, 0.0, 1.0, 1.0])) == pytest.approx(0.15)
+    assert start_of_motion(np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.0, 0.0, 1.0, 1.0])) == pytest.approx(0.15)
 
 
 @pytest.mark.render
@@ -228,7 +228,7 @@ def test_a_picture_that_does_not_grow_is_no_measurement():
         measure_lens(replace(rig, zoom=FrozenCamera(rig.zoom)))
 
 
-def test_a_lens_that_hardly_zooms_is_told():
+def test_a_lens_without_zoom_is_an_error():
     config = parse_config({"sim": {"zoom": {"focal_mm": [6.0, 6.3]}, "effects": {"optics": False}}})
     with SimWorld(config, rendered=()).rig as rig, pytest.raises(CalibrationError, match=r"zooms by 1\.05 times"):
         measure_lens(rig)

@@ -150,7 +150,7 @@ def check_permission(port: str) -> None:
         )
 
 
-def likeliest(names: Iterable[str], wanted: str, most: int = 12) -> str:
+def closest(names: Iterable[str], wanted: str, most: int = 12) -> str:
     """List valid choices for a message, those most like ``wanted`` first, at most ``most`` of them."""
     names = sorted(set(names))
     near = [name for name in names if wanted.lower() in name.lower()]
@@ -203,7 +203,7 @@ class Setting:
         low: least value of a range.
         high: greatest value of a range.
         step: step between values of a range.
-        choices: valid values of a choice.
+        choices: valid values of a choice or switch.
         readonly: whether the setting can only be read.
     """
 
@@ -343,7 +343,7 @@ class GphotoLink:
             choices = tuple(str(choice) for choice in widget.get_choices())
             return Setting("choice", str(value), choices=choices, readonly=readonly)
         if kind == gp.GP_WIDGET_TOGGLE:
-            return Setting("switch", float(value), 0.0, 1.0, readonly=readonly)
+            return Setting("switch", float(value), choices=("0", "1"), readonly=readonly)
         if kind == gp.GP_WIDGET_DATE:
             return Setting("date", float(value), readonly=readonly)
         return Setting("text", str(value), readonly=readonly)
@@ -400,7 +400,7 @@ def cameras() -> list[str]:
 def _check_model(model: str, abilities: Any) -> None:
     names = {str(abilities.get_abilities(i).model) for i in range(abilities.count())}
     if model not in names:
-        raise ConfigError(f"hardware.zoom.model: gphoto2 knows no '{model}'; it knows {likeliest(names, model, 5)}")
+        raise ConfigError(f"hardware.zoom.model: gphoto2 knows no '{model}'; it knows {closest(names, model, 5)}")
 
 
 def _listed(found: list[tuple[str, str]]) -> str:

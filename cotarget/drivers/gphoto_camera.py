@@ -27,7 +27,7 @@ from cotarget.drivers.gphoto import (
     GphotoLink,
     LinkError,
     Setting,
-    likeliest,
+    closest,
 )
 from cotarget.drivers.lens import LensMotion, LensPositions
 from cotarget.drivers.mjpeg import DamagedError, decode_jpeg
@@ -151,13 +151,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ZoomSetting:
-    """The camera setting that moves the lens.
-
-    Attributes:
-        name: gphoto2's name of the setting.
-        lens: focal lengths of the positions.
-        values: value of the setting for each position.
-    """
+    """The camera setting that moves the lens: its name, focal lengths, and the value for each position."""
 
     name: str
     lens: LensPositions
@@ -177,7 +171,7 @@ def patiently(clock: Clock, call: Callable[[], T]) -> T:
 
 
 def set_up(link: CameraLink, config: GphotoSettings, clock: Clock, camera: str) -> ZoomSetting:
-    """Switch an opened camera, of a name for messages, to shooting mode and apply the configured settings.
+    """Switch an opened camera to shooting mode and apply the configured settings; ``camera`` names it in messages.
 
     Raises:
         ConfigError: the camera has no such setting or value, or cannot be zoomed as configured.
@@ -197,7 +191,7 @@ def set_up(link: CameraLink, config: GphotoSettings, clock: Clock, camera: str) 
 
 def _apply(link: CameraLink, clock: Clock, camera: str, names: Collection[str], name: str, value: str) -> None:
     if name not in names:
-        known = likeliest(names, name)
+        known = closest(names, name)
         raise ConfigError(f"hardware.zoom.settings: the {camera} has no setting '{name}'; valid here: {known}")
     setting = patiently(clock, lambda: link.get(name))
     _check(setting, f"hardware.zoom.settings.{name}", value)
@@ -213,10 +207,8 @@ def _check(setting: Setting, where: str, value: str) -> None:
     """Refuse a value that a setting does not take."""
     if setting.readonly:
         raise ConfigError(f"{where}: this camera's can only be read; it is '{setting.value}'")
-    if setting.kind == "choice" and value not in setting.choices:
-        raise ConfigError(f"{where}: '{value}' is not one of: {likeliest(setting.choices, value)}")
-    if setting.kind == "switch" and value not in ("0", "1"):
-        raise ConfigError(f"{where}: '{value}' is not one of: 0, 1")
+    if setting.choices and value not in setting.choices:
+        raise ConfigError(f"{where}: '{value}' is not one of: {closest(setting.choices, value)}")
     if setting.kind == "range":
         number = _number(value)
         if number is None or not setting.low <= number <= setting.high:
@@ -231,7 +223,7 @@ def _zoom_setting(
     """Find the setting that moves the lens, and check it against the configured lens table."""
     name, (first, last) = config.zoom_key, (config.lens[0][0], config.lens[-1][0])
     if name not in names:
-        known = likeliest(names, name)
+        known = closest(names, name)
         raise ConfigError(
             f"hardware.zoom: the {camera} has no setting '{name}'; it cannot be zoomed; its settings are: {known}"
         )
@@ -265,12 +257,8 @@ def _positions(setting: Setting) -> dict[int, str | float]:
     return {round(number): choice for choice, number in numbers.items() if number is not None}
 
 
-def position_in(setting: Setting) -> float | None:
-    """Read the lens position [1] from a setting; None where it shows none."""
-    return _number(setting.value)
-
-
 def _number(value: str | float) -> float | None:
+    """Parse a setting's value; None where it is no number."""
     try:
         return float(value)
     except ValueError:
@@ -323,13 +311,9 @@ class LensJob:
         self._patience = Patience(clock)
 
     def begin(self, zoom: ZoomSetting, first: bool) -> None:
-        """Read the lens position of a camera just opened.
-
-        At the first opening that position becomes the command. After a loss the lens is sent back to the command from
-        before.
-        """
+        """Take a camera's lens position as the command when first opened; after a loss send the lens back."""
         self._zoom, self._order, shared = zoom, -1, self._shared
-        reading = position_in(patiently(self._clock, lambda: self._link.get(zoom.name)))
+        reading = _number(patiently(self._clock, lambda: self._link.get(zoom.name)).value)
         position = zoom.lens.positions[0] if reading is None else reading
         now = self._clock.now()
         with shared.changed:
@@ -375,7 +359,7 @@ class LensJob:
         self._deadline = max(motion.arrives, now) + VERIFY_S
 
     def _verify(self, zoom: ZoomSetting, wanted: int) -> None:
-        reading = position_in(self._link.get(zoom.name))
+        reading = _number(self._link.get(zoom.name).value)
         if reading == wanted:
             with self._shared.changed:
                 self._shared.standing = self._shared.order == self._order
@@ -467,12 +451,7 @@ class ViewJob:
         self._patience = Patience(clock)
 
     def begin(self) -> None:
-        """Wait for the first frame of a camera just opened.
-
-        Raises:
-            ConfigError: the frame has another size than configured.
-            DeviceError: no frame came.
-        """
+        """Wait for the first frame of a camera just opened, and check its size."""
         deadline = self._clock.now() + FIRST_FRAME_S
         while True:
             data = patiently(self._clock, self._link.preview)
@@ -545,12 +524,7 @@ class Shooting:
         self._pause = FIRST_PAUSE_S
 
     def open(self) -> ZoomSetting:
-        """Open the camera and check it against the configuration.
-
-        Raises:
-            ConfigError: the camera differs from the configuration.
-            DeviceError: the camera does not answer, or not correctly.
-        """
+        """Open the camera and check it against the configuration."""
         tries = USB_TRIES if self._config.port.startswith("usb:") else 1
         for left in reversed(range(tries)):
             try:

@@ -270,7 +270,7 @@ class Halt:
     Attributes:
         number: sequence number of the request, shared with moves.
         answered: whether the unit acknowledged the halt.
-        done: set when it has, or will not.
+        done: set when the unit has acknowledged the halt, or will not.
     """
 
     number: int
@@ -290,7 +290,7 @@ PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
 LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: a unit may answer only when it stands [s]
 
 
-def halted_at_last(link: HeadLink, reason: BaseException) -> bool:
+def try_last_halt(link: HeadLink, reason: BaseException) -> bool:
     """Halt the unit a last time, unless its port has failed; return whether it acknowledged that."""
     if isinstance(reason, LostError):
         return False
@@ -340,7 +340,7 @@ class Loop:
         self.errors: deque[DeviceError] = deque(maxlen=1)
         while not all(track.polls for track in self._tracks):
             self._poll_position()
-        self.snapshot = self._look()
+        self.snapshot = self._make_snapshot()
         link.hurry = lambda: self.closing or bool(self.halts)
 
     def turn(self) -> None:
@@ -363,7 +363,7 @@ class Loop:
             self._cuts += 1
             self._expect_motion()
             if self._active is not None:
-                self._take_up_again(self._active, cut)
+                self._requeue(self._active, cut)
             elif self._cuts >= TRIES:
                 raise
         self._link.check()
@@ -371,7 +371,7 @@ class Loop:
     def stop_for_good(self, reason: DeviceError) -> None:
         """Halt the head a last time, and end all requests with an error."""
         self.closing = True
-        self.rests = halted_at_last(self._link, reason)
+        self.rests = try_last_halt(self._link, reason)
         for move in [*([self._active] if self._active else []), *drained(self.moves)]:
             move.finish(reason)
         for halt in drained(self.halts):
@@ -440,13 +440,13 @@ class Loop:
         self._polled = True
         move = self._active
         if move is not None and move.deadline is not None:
-            if self._stand() and not self._astray(move):
+            if self._stand() and not self._off_goal(move):
                 self._active = None
-                self.snapshot = self._look()
+                self.snapshot = self._make_snapshot()
                 move.finish()
             elif self._late(move, move.deadline):
                 raise self._stalled(move)
-        self.snapshot = self._look()
+        self.snapshot = self._make_snapshot()
 
     def _poll_position(self) -> None:
         for axis, position, t in self._link.poll():
@@ -467,7 +467,7 @@ class Loop:
             self._active.finish(reason)
             self._active = None
 
-    def _take_up_again(self, move: Move, cut: CutError) -> None:
+    def _requeue(self, move: Move, cut: CutError) -> None:
         """Queue a cut move again if its caller waits for it; other callers send a new move or read the state."""
         self._active = None
         if not move.wait or move.cuts == TRIES:
@@ -477,13 +477,13 @@ class Loop:
         move.deadline = None
         self.moves.appendleft(move)  # a newer move in the queue replaces it, a halt drops it
 
-    def _astray(self, move: Move) -> bool:
+    def _off_goal(self, move: Move) -> bool:
         """Return whether the newest poll of an axis is off the move's goal."""
         return any(track.position != goal for track, goal in zip(self._tracks, move.goals, strict=True))
 
     def _late(self, move: Move, deadline: float) -> bool:
         """Return whether a poll after the deadline shows an axis off its goal; a late thread alone does not count."""
-        return min(track.polls[-1][0] for track in self._tracks) > deadline and self._astray(move)
+        return min(track.polls[-1][0] for track in self._tracks) > deadline and self._off_goal(move)
 
     def _stalled(self, move: Move) -> PositionLostError:
         pan, tilt = (track.position for track in self._tracks)
@@ -497,7 +497,7 @@ class Loop:
     def _stand(self) -> bool:
         return all(track.stands() for track in self._tracks)
 
-    def _look(self) -> HeadSnapshot:
+    def _make_snapshot(self) -> HeadSnapshot:
         """Make a snapshot of both axes at the older one of their newest polls."""
         pan, tilt = self._tracks
         t = min(pan.polls[-1][0], tilt.polls[-1][0])
@@ -509,7 +509,7 @@ class Loop:
 STANDS_S = 5.0  # time limit for a head that turned when it was opened to stand after the halt [s]
 HALT_S = 1.0  # time limit for the answer to a halt, beyond braking; synchronising the line may come first [s]
 CLOSE_S = 5.0  # time limit for the thread to end [s]
-LOOK_S = 0.2  # a caller that waits for a move checks with this period whether the thread still runs [s]
+CHECK_S = 0.2  # a caller that waits for a move checks with this period whether the thread still runs [s]
 NOTHING_SAID = SafetyConfig()
 # Limits differ by a few steps from unit to unit and from reset to reset; a larger difference is another unit's.
 LIMITS_DEG = 3.0
@@ -565,7 +565,7 @@ class PolledHead:
             self._loop = Loop(self._link, clock, config.command_delay_s)
             self._wait_until_it_stands(clock)
         except BaseException as error:
-            halted_at_last(self._link, error)
+            try_last_halt(self._link, error)
             self._remember(error)
             self._link.close()
             raise
@@ -584,7 +584,7 @@ class PolledHead:
         Raises:
             DeviceError: an error occurred since the last call, or the line is dead.
         """
-        self._raise_what_happened()
+        self._raise_pending()
         # In this order: the loop sets the snapshot to moving before it takes a request out of the queue.
         waiting = bool(self._loop.moves)
         seen = self._loop.snapshot
@@ -608,7 +608,7 @@ class PolledHead:
             DeviceError: an angle is not finite, the head did not arrive, or an error occurred since the last call.
         """
         number = next(self._numbers)
-        self._raise_what_happened()
+        self._raise_pending()
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
         fastest = self._limits.capped(speed)
@@ -680,7 +680,7 @@ class PolledHead:
         """Convert steps of the unit to angles [rad]."""
         return self._signs[0] * pan * self.axes[0].step, self._signs[1] * tilt * self.axes[1].step
 
-    def _raise_what_happened(self) -> None:
+    def _raise_pending(self) -> None:
         if self._closed:
             raise DeviceError(f"the pan-tilt unit at {self._link.name} is closed")
         if self._dead is not None:
@@ -689,9 +689,9 @@ class PolledHead:
             raise self._loop.errors.popleft()
 
     def _wait_for(self, move: Move) -> None:
-        while not move.done.wait(LOOK_S):
+        while not move.done.wait(CHECK_S):
             if not self._thread.is_alive():
-                self._raise_what_happened()
+                self._raise_pending()
         if move.error is not None:
             kind = HaltedError if isinstance(move.error, HaltedError) else DeviceError
             raise kind(str(move.error)) from move.error
@@ -705,11 +705,7 @@ class PolledHead:
 
 
 def _checked(link: HeadLink) -> HeadLink:
-    """Refuse a link that lacks a part of `HeadLink`.
-
-    Raises:
-        ConfigError: it does; the message names the part.
-    """
+    """Refuse a link that lacks a part of `HeadLink`, and name the part."""
     needed = ("name", *(name for name in vars(HeadLink) if not name.startswith("_")))
     if lacks := [name for name in needed if not hasattr(link, name)]:
         if "close" not in lacks:
@@ -719,11 +715,7 @@ def _checked(link: HeadLink) -> HeadLink:
 
 
 def compare(config: PolledHeadSettings, axes: tuple[AxisFacts, AxisFacts]) -> None:
-    """Compare the unit's steps and limits with rig.toml.
-
-    Raises:
-        ConfigError: they differ; the message has both, and what to write.
-    """
+    """Refuse a unit whose steps or limits differ from rig.toml; the message has both, and what to write."""
     for word, axis in zip(("pan", "tilt"), axes, strict=True):
         own = math.degrees(axis.step)
         if abs(own - config.step_deg) > STEP_SHARE * config.step_deg:
@@ -736,8 +728,8 @@ def compare(config: PolledHeadSettings, axes: tuple[AxisFacts, AxisFacts]) -> No
         ("tilt", axes[1], config.tilt_deg, config.tilt_sign),
     ):
         found = axis.degrees(sign)
-        if not _alike(found, expected):
-            turned = f", or {word}_sign = {-sign}" if _alike(axis.degrees(-sign), expected) else ""
+        if not _agree(found, expected):
+            turned = f", or {word}_sign = {-sign}" if _agree(axis.degrees(-sign), expected) else ""
             raise ConfigError(
                 f"hardware.head.{word}_deg: the unit at {config.port} goes from {found[0]:.1f} to {found[1]:.1f} "
                 f"degrees, not from {expected[0]:g} to {expected[1]:g}; write {word}_deg = "
@@ -745,7 +737,7 @@ def compare(config: PolledHeadSettings, axes: tuple[AxisFacts, AxisFacts]) -> No
             )
 
 
-def _alike(found: tuple[float, float], expected: tuple[float, float]) -> bool:
+def _agree(found: tuple[float, float], expected: tuple[float, float]) -> bool:
     return max(abs(a - b) for a, b in zip(found, expected, strict=True)) <= LIMITS_DEG
 
 
@@ -771,11 +763,7 @@ def _steps(speed: float, axis: AxisFacts) -> int:
 
 
 def _refuse_too_slow(key: str, cap_deg_s: float | None, axes: tuple[AxisFacts, AxisFacts], port: str) -> None:
-    """Refuse a speed cap below the unit's lowest speed.
-
-    Raises:
-        ConfigError: the cap is too low; the message names the lowest speed.
-    """
+    """Refuse a speed cap below the unit's lowest speed, and name that speed."""
     slowest = max(max(axis.slowest, 1) * math.degrees(axis.step) for axis in axes)
     if cap_deg_s is not None and cap_deg_s * (1 + ROUNDING) < slowest:
         least = math.ceil(100 * slowest) / 100

@@ -211,7 +211,7 @@ class D46Head(PolledHead):
                     for name in ("U", "PN", "PX", "TN", "TX")
                 )
             except (SilentError, ReplyError, RefusedError) as error:
-                raise _stranger(line) from error
+                raise _no_unit(line) from error
         refuse_uncalibrated(port, limits)
         return f"{version}, unit {unit}"
 
@@ -240,7 +240,7 @@ class D46Head(PolledHead):
             greet(line)
             _refuse_if_stopped(stopped)
             lost.note(str(PositionLostError(port, "has begun a reset that did not come to its end")))
-            _turn(line, stopped)
+            _run_reset(line, stopped)
             line.hurry = lambda: False
             _expect_both_axes(line)
             unit = identify(line)
@@ -263,22 +263,14 @@ def _open_link(config: D46Settings, clock: Clock) -> D46Link:
 
 
 def refuse_events(line: Line) -> None:
-    """Raise if the unit has reported a limit or a cable event: a motor may have lost steps.
-
-    Raises:
-        PositionLostError: an event was reported; the message names it.
-    """
+    """Raise PositionLostError if the unit has reported a limit or a cable event: a motor may have lost steps."""
     if line.events:
         what = " and ".join(dict.fromkeys(ptu_protocol.EVENT_WORDS[event] for event in line.events))
         raise PositionLostError(line.name, f"reports that {what}: it was halted, and its position may be lost")
 
 
 def halt_outright(line: Line, patience: float) -> None:
-    """Halt a unit that may echo again or still send old answers; the line takes no other command afterwards.
-
-    Raises:
-        DeviceError: the unit did not acknowledge the halt in time.
-    """
+    """Halt a unit that may echo again or still send old answers; the line takes no other command afterwards."""
     line.hurry, line.strict = (lambda: False), False
     for left in reversed(range(HALT_TRIES)):
         try:
@@ -290,11 +282,7 @@ def halt_outright(line: Line, patience: float) -> None:
 
 
 def greet(line: Line) -> None:
-    """Switch the unit's echo and verbose answers off, from any earlier mode.
-
-    Raises:
-        DeviceError: there is no unit.
-    """
+    """Switch the unit's echo and verbose answers off, from any earlier mode; raise where there is no unit."""
     for _ in range(GREETINGS):
         line.write(DELIMITER)
         line.drain(GREETING_QUIET_S, GREETING_MOST_S)
@@ -308,16 +296,12 @@ def greet(line: Line) -> None:
                 return
         except (SilentError, ReplyError, RefusedError) as error:
             log.info("%s: %s", line.name, error)
-    raise _stranger(line)
+    raise _no_unit(line)
 
 
 def identify(line: Line) -> UnitInfo:
-    """Query the unit's version, step mode and axes.
-
-    Raises:
-        DeviceError: the unit does not answer.
-    """
-    return UnitInfo(_told(line, "V"), _told(line, "WP"), _axis(line, "P"), _axis(line, "T"))
+    """Query the unit's version, step mode and axes."""
+    return UnitInfo(_text(line, "V"), _text(line, "WP"), _axis(line, "P"), _axis(line, "T"))
 
 
 class UncalibratedError(DeviceError):
@@ -354,7 +338,7 @@ def _axis(line: Line, axis: AxisName) -> AxisFacts:
     return facts
 
 
-def _told(line: Line, question: str) -> str:
+def _text(line: Line, question: str) -> str:
     """Query a text; empty where the firmware is too old for the query."""
     try:
         return line.query(command(question), str, PATIENCE_S)[0]
@@ -375,7 +359,7 @@ def _make_independent(line: Line) -> None:
         log.info("%s: the firmware has no control modes", line.name)
 
 
-def _stranger(line: Line) -> DeviceError:
+def _no_unit(line: Line) -> DeviceError:
     """Make the error for a port without a usable pan-tilt unit, from the received bytes."""
     heard, events = line.heard, ptu_protocol.split_events(line.heard)[1]
     if not heard.strip():
@@ -402,7 +386,7 @@ NOT_HALTED = (
 )
 
 
-def _turn(line: Line, stopped: Callable[[], str | None]) -> None:
+def _run_reset(line: Line, stopped: Callable[[], str | None]) -> None:
     """Send the reset and wait for its end."""
     line.hurry = lambda: stopped() is not None  # ends the wait for the reset's answer
     try:
@@ -432,11 +416,7 @@ def _halt_after_reset(line: Line) -> str:
 
 
 def _expect_both_axes(line: Line) -> None:
-    """Check that both axes met their limits; a unit may be set to leave one or both out of its resets.
-
-    Raises:
-        DeviceError: an axis did not.
-    """
+    """Refuse a reset in which an axis met no limit; a unit may be set to leave axes out of its resets."""
     left_out = [ptu_protocol.AXIS_WORDS[axis] for axis in ptu_protocol.AXES if axis not in line.events]
     line.events.clear()
     if left_out:

@@ -39,7 +39,7 @@ PLAIN = re.compile(rb"[\x20-\x7e\t]*")
 # Numbers stand alone: digits next to other characters were garbled. No number has more than nine digits.
 INTEGER = re.compile(r"(?<!\S)[-+]?[0-9]{1,9}(?=[.,;]?(?:\s|$))")
 DECIMAL = re.compile(r"(?<!\S)[0-9]{1,9}(?:\.[0-9]{1,9})?(?=[.,;]?(?:\s|$))")
-# Words that name a mode; the text around them differs between firmware versions.
+# Words that name a mode; firmware versions differ in the text around them.
 ECHO_ON, ECHO_OFF = (re.compile(rf"echo.*\b{word}\b", re.IGNORECASE) for word in ("on", "off"))
 TERSE, VERBOSE = re.compile("terse", re.IGNORECASE), re.compile("verbose", re.IGNORECASE)
 INDEPENDENT, VELOCITY = re.compile("indep", re.IGNORECASE), re.compile("veloc", re.IGNORECASE)
@@ -272,7 +272,7 @@ class Line(SerialLine):
             except (SilentError, ReplyError) as error:
                 resynchronized(error, self.resync(error))
                 if not left:
-                    raise self.nonsense(error) from error
+                    raise self._final_error(error) from error
         raise AssertionError("unreachable")
 
     def resync(self, reason: DeviceError) -> bool:
@@ -289,7 +289,7 @@ class Line(SerialLine):
             PositionLostError: the unit was switched off and on.
             LostError: the port failed.
         """
-        log.info("%s: back in step after: %s", self.name, reason)
+        log.info("%s: synchronizing after: %s", self.name, reason)
         noise, self._strange = self._strange + self._buffer, b""
         self.write(DELIMITER + HALT if self.hurry() else DELIMITER)
         noise += self.drain(QUIET_S, DRAIN_S)
@@ -315,7 +315,7 @@ class Line(SerialLine):
     def _restarted(self) -> PositionLostError:
         return PositionLostError(self.name, "was switched off and on, so that its position may be lost")
 
-    def nonsense(self, error: DeviceError) -> DeviceError:
+    def _final_error(self, error: DeviceError) -> DeviceError:
         """Make the error for a unit whose answers stayed invalid or absent."""
         if isinstance(error, SilentError):
             return error
@@ -335,7 +335,7 @@ class Line(SerialLine):
                 self._buffer = rest
             elif rest and self.strict:
                 self._strange = rest
-                raise ReplyError(f"{shown(rest)} came unasked")
+                raise ReplyError(f"{shown(rest)} came without a command")
 
     def _reply(self, deadline: float, skipping: bool) -> tuple[Reply, float]:
         """Read the next line that is an answer; return it and the time of its first byte [s]."""

@@ -29,13 +29,13 @@ DEADLINE_S = 30.0  # for what should come at once
         ([0, 0, 2.0], [0, 0, -90], ["90 degrees anticlockwise in its plane"]),
     ],
 )
-def test_a_person_is_told_where(translation, rotvec_deg, words):
+def test_a_person_reads_where_to_hold_the_board(translation, rotvec_deg, words):
     said = in_words(pose(translation, rotvec_deg))
     assert all(word in said for word in words)
 
 
 @pytest.mark.parametrize(("axis", "corner"), [([0, 30, 0], [0.8, 0, 0]), ([30, 0, 0], [0, -0.5, 0])])
-def test_the_edges_that_are_told_are_the_nearer_ones(axis, corner):
+def test_the_named_edges_are_the_nearer_ones(axis, corner):
     """A turn about y (down) by +30 degrees takes x, to the right, towards -z, to the camera; one about x takes -y."""
     first, other = pose([0, 0, 2.0], axis).apply([[0.0, 0, 0], corner])[:, 2]
     assert other < first

@@ -115,7 +115,7 @@ def test_reading_says_why_no_newer_frame_comes_until_the_next_one(bench, name):
     assert "no newer picture" in bench.why()
 
 
-def test_silence_and_a_remark_are_told_together(bench):
+def test_an_error_names_silence_and_remark(bench):
     bench.put(image(10))
     bench.frames.remark("its input has no video")
     bench.clock.t += 0.3

@@ -125,7 +125,7 @@ def test_one_of_two_cameras_is_chosen_by_its_port(gphoto2):
         ("usb:", "canon", (CANON, NIKON), "model", ("Canon S5", "Nikon Z")),
     ],
 )
-def test_cameras_that_are_not_found_are_told_with_those_that_are(gphoto2, port, model, found, key, choices):
+def test_an_error_lists_the_cameras_that_are_there(gphoto2, port, model, found, key, choices):
     gphoto2(*found)
     for call in (GphotoLink(port, model).open, lambda: probe(port, model)):
         with pytest.raises((ConfigError, DeviceError), match=rf"^hardware\.zoom\.{key}: ") as error:
@@ -133,7 +133,7 @@ def test_cameras_that_are_not_found_are_told_with_those_that_are(gphoto2, port, 
         assert all(choice in str(error.value) for choice in choices)
 
 
-def test_a_camera_of_another_program_is_told_with_the_remedy(gphoto2):
+def test_a_camera_of_another_program_is_an_error_with_the_remedy(gphoto2):
     module = gphoto2(CANON)
     module.init = module.refuse
     with pytest.raises(LinkError, match="unmount it") as error:
@@ -141,13 +141,24 @@ def test_a_camera_of_another_program_is_told_with_the_remedy(gphoto2):
     assert error.value.code == CLAIM
 
 
-def test_a_camera_of_another_user_is_told_with_the_remedy(gphoto2, monkeypatch):
+def test_a_camera_of_another_user_is_an_error_with_the_remedy(gphoto2, monkeypatch):
     gphoto2(CANON)
     monkeypatch.setattr(Path, "is_char_device", lambda path: path == Path("/dev/bus/usb/001/005"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     for call in (GphotoLink("usb:", "").open, lambda: probe("usb:")):
         with pytest.raises(DeviceError, match=r"/dev/bus/usb/001/005; add yourself to its group"):
             call()
+
+
+def test_opening_keeps_descriptor_0_which_libgphoto2_closes(gphoto2):
+    gphoto2(CANON).init = lambda: os.close(0)
+    kept, before = os.dup(0), os.fstat(0)
+    try:
+        GphotoLink("usb:", "").open()
+        assert os.path.samestat(os.fstat(0), before)
+    finally:
+        os.dup2(kept, 0)
+        os.close(kept)
 
 
 def test_a_search_that_fails_is_an_error_of_the_device(gphoto2):
@@ -191,12 +202,12 @@ def test_libgphoto2s_own_virtual_camera_cannot_be_zoomed(tmp_path):
 
 
 @pytest.mark.wire
-def test_where_somebody_listens_and_where_nobody_does():
+def test_a_network_port_needs_a_listener():
     with s5is_process() as process:
         assert probe(process.port) == f"something listens at {full_port(process.port)}"
         with pytest.raises(ConfigError, match=r"^hardware\.zoom\.model: "):
             probe(process.port, "S5")
-    nobody = "ptpip:127.0.0.1:1"
+    unused = "ptpip:127.0.0.1:1"
     for call in (probe, lambda port: GphotoCamera(GphotoSettings(port=port), MonotonicClock())):
         with pytest.raises(DeviceError, match=r"^hardware\.zoom\.port: no camera listens"):
-            call(nobody)
+            call(unused)

@@ -266,7 +266,7 @@ VIEW_FAULTS = {
 
 
 @pytest.mark.parametrize("name", VIEW_FAULTS)
-def test_a_fault_of_the_viewfinder_is_told_and_recovered_from(name):
+def test_a_viewfinder_fault_is_named_and_recovered_from(name):
     changes, reason = VIEW_FAULTS[name]
     bench = Bench()
     bench.run(0.5)
@@ -337,7 +337,7 @@ LENS_FAULTS = {
 
 
 @pytest.mark.parametrize("name", LENS_FAULTS)
-def test_a_fault_of_the_lens_is_recovered_from_or_told_until_the_next_command(name):
+def test_a_lens_fault_is_recovered_from_or_lasts_until_the_next_command(name):
     changes, arrives, count = LENS_FAULTS[name]
     bench = Bench()
     changed(**changes)(bench.camera)
@@ -515,7 +515,7 @@ def test_one_thread_has_the_camera_and_commands_do_not_wait_for_its_next_frame()
     assert link.commands("capture") == [1, 0]
 
 
-def test_a_lens_in_trouble_is_told_until_it_is_sent_again(monkeypatch):
+def test_a_lens_error_lasts_until_the_next_command(monkeypatch):
     monkeypatch.setattr("cotarget.drivers.gphoto_camera.VERIFY_S", 0.0)
     with opened(replace(CONFIG, lens_speed=1e4)) as (camera, link):
         link.ignore = 2
@@ -545,7 +545,7 @@ STILL_FAULTS = {
 
 
 @pytest.mark.parametrize("name", STILL_FAULTS)
-def test_a_fault_of_a_still_is_told_and_the_next_one_is_taken(monkeypatch, name):
+def test_after_a_still_fault_the_next_still_is_taken(monkeypatch, name):
     changes, limits, taken = STILL_FAULTS[name]
     with opened() as (camera, link):
         changed(**changes)(link)
@@ -585,27 +585,13 @@ def test_reading_waits_while_a_still_is_taken():
         assert not taker.is_alive()
 
 
-def test_a_gone_camera_says_so_at_every_call_also_to_who_waits(monkeypatch):
+def test_a_camera_that_is_gone_raises_at_every_call(monkeypatch):
     monkeypatch.setattr("cotarget.drivers.gphoto_camera.RECONNECT_S", 0.0)
     with opened() as (camera, link):
         link.fail = {"open": [IO, ...], "shoot": [BUSY, ...], "preview": [BUSY, BUSY, IO]}
         for call in (camera.capture, camera.read, camera.state, camera.capture, lambda: camera.zoom(1000.0)):
             with pytest.raises(DeviceError, match="is gone"):
                 call()
-
-
-def test_closing_ends_a_wait():
-    with opened() as (camera, _):
-        said = []
-
-        def wait():
-            said.append(trouble(lambda: camera.read(math.inf, DEADLINE_S)))
-
-        reader = threading.Thread(target=wait, daemon=True)
-        reader.start()
-        camera.close()
-        reader.join(DEADLINE_S)
-        assert "closed" in said[0]
 
 
 def test_opening_fails_on_the_callers_thread():
@@ -616,7 +602,7 @@ def test_opening_fails_on_the_callers_thread():
     assert threading.active_count() == before
 
 
-def test_an_opening_without_end_is_given_up(monkeypatch):
+def test_opening_has_a_time_limit(monkeypatch):
     release = threading.Event()
     monkeypatch.setattr("cotarget.drivers.gphoto_camera.OPEN_LIMIT_S", 0.01)
     monkeypatch.setattr("cotarget.drivers.gphoto_camera.CLOSE_LIMIT_S", 0.01)
@@ -626,7 +612,7 @@ def test_an_opening_without_end_is_given_up(monkeypatch):
     wait_for(lambda: "zoom camera" not in [thread.name for thread in threading.enumerate()])
 
 
-def test_a_mistake_in_the_driver_is_no_silence_and_no_traceback(caplog):
+def test_an_exception_in_the_driver_is_raised_by_read_without_traceback(caplog):
     caplog.set_level(logging.INFO)
 
     def wrong():

@@ -70,7 +70,7 @@ def devices(monkeypatch):
 
 
 @pytest.mark.parametrize(("table", "key"), [("head", "port"), ("fixed", "url"), ("zoom", "port")])
-def test_a_device_that_is_not_named_is_asked_for_before_any_is_opened(devices, table, key):
+def test_a_missing_key_is_named_before_a_device_is_opened(devices, table, key):
     log, *_ = devices
     nameless = {**getattr(CONFIG.hardware, table), key: ""}
     config = dataclasses.replace(CONFIG, hardware=dataclasses.replace(CONFIG.hardware, **{table: nameless}))
@@ -84,7 +84,7 @@ def test_a_rig_toml_with_a_sim_section_only_is_no_real_rig():
         open_rig(RigConfig(backend="hardware", hardware=HardwareConfig()), guarded=False)
 
 
-def test_the_head_comes_last_and_is_let_go_first(devices):
+def test_the_head_is_opened_last_and_closed_first(devices):
     log, *_ = devices
     with open_rig(CONFIG, guarded=False) as rig:
         assert log == [f"open {name}" for name in ORDER]
@@ -101,8 +101,18 @@ def test_the_head_comes_last_and_is_let_go_first(devices):
     assert len(log) == len(ORDER)
 
 
+def test_opening_shortens_the_thread_switch_interval(devices):
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(5e-3)  # Python's default
+    try:
+        with open_hardware(CONFIG):
+            assert sys.getswitchinterval() < 1e-3
+    finally:
+        sys.setswitchinterval(before)
+
+
 @pytest.mark.parametrize("missing", ORDER)
-def test_where_one_is_missing_the_others_are_let_go_and_the_head_is_not_touched(devices, missing):
+def test_a_missing_device_closes_the_others_and_leaves_the_head_alone(devices, missing):
     log, lacking, _ = devices
     lacking.append(missing)
     with pytest.raises(DeviceError, match=f"{missing}: is not there"):
@@ -121,7 +131,7 @@ def port():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the devices have to refuse a second program")
 @pytest.mark.parametrize("by", ["its name", "another name", "a URL"])
-def test_a_rig_that_another_program_has_is_said_to_be_before_any_device_is_asked(devices, port, tmp_path, by):
+def test_a_rig_in_use_is_refused_before_a_device_is_opened(devices, port, tmp_path, by):
     """Within one process as well; and the claim ends with the rig."""
     log, missing, _ = devices
     (tmp_path / "link").symlink_to(port)
@@ -146,7 +156,7 @@ def test_a_rig_that_another_program_has_is_said_to_be_before_any_device_is_asked
 
 
 @pytest.mark.parametrize("which", ORDER)
-def test_one_that_does_not_close_keeps_none_of_the_others(devices, which):
+def test_a_device_that_does_not_close_does_not_keep_the_others(devices, which):
     log, _, stuck = devices
     rig = open_hardware(CONFIG)
     stuck.append(which)
@@ -157,7 +167,7 @@ def test_one_that_does_not_close_keeps_none_of_the_others(devices, which):
     rig.close()
 
 
-def test_ctrl_c_while_it_opens_lets_go_too(devices, monkeypatch):
+def test_ctrl_c_while_a_device_opens_closes_the_others(devices, monkeypatch):
     log, *_ = devices
 
     def interrupted(*_):

@@ -2,6 +2,7 @@
 
 import math
 import threading
+from dataclasses import replace
 
 import pytest
 
@@ -98,10 +99,22 @@ def test_it_moves_in_its_units_with_its_signs(opened, link):
     assert math.degrees(head.limits.speed) == pytest.approx(40.0)
     pan, tilt = head.move(math.radians(10.04), math.radians(-120.0), wait=True)
     assert (math.degrees(pan), math.degrees(tilt)) == (pytest.approx(10.0), pytest.approx(-90.0))
-    assert link.sent == [((100, 900), (400, 400))]
+    head.move(0.0, 0.0, speed=(math.radians(10.0), math.radians(20.0)), wait=True)
+    assert link.sent == [((100, 900), (400, 400)), ((0, 0), (100, 200))]
 
 
-def test_a_halt_is_acknowledged_and_the_last_word_before_the_port_is_free_is_one(opened, link):
+def test_limits_and_braking_are_those_of_the_weaker_axis(opened, link):
+    """Tilt turns at 30 degrees/s, where 40 are configured, and brakes from that in 3 s."""
+    link.axes = (FACTS, replace(FACTS, fastest=300, acceleration=100))
+    patience = []
+    link.halt = patience.append
+    head = opened()
+    assert (head.limits.speed, head.limits.acceleration) == (pytest.approx(300 * STEP), pytest.approx(100 * STEP))
+    head.halt()
+    assert patience[0] >= 3.0
+
+
+def test_closing_sends_a_last_halt_before_the_port_is_closed(opened, link):
     head = opened()
     head.halt()
     head.close()
@@ -111,7 +124,7 @@ def test_a_halt_is_acknowledged_and_the_last_word_before_the_port_is_free_is_one
             call()
 
 
-def test_a_refused_move_is_halted_and_told_to_its_caller(opened, link):
+def test_a_refused_move_is_halted_and_raises(opened, link):
     head = opened()
     link.fails = [RefusedError("no")]
     with pytest.raises(DeviceError, match=r"^no$"):
@@ -128,7 +141,7 @@ def test_a_move_cut_by_a_silence_is_sent_again_to_a_caller_that_waits(opened, li
 
 
 @pytest.mark.parametrize("between", [True, False])
-def test_silences_end_it_where_no_position_comes_between_them(opened, link, between):
+def test_repeated_silence_without_a_position_ends_the_head(opened, link, between):
     head = opened()
     cut = CutError("silent for a while")
     link.polls_fail = [cut, cut, None] * 10 if between else [cut, ...]
@@ -147,7 +160,7 @@ def test_silences_end_it_where_no_position_comes_between_them(opened, link, betw
     ("error", "halted"),
     [(SilentError("it is silent"), True), (DeviceError("no"), True), (LostError("COUNTER", OSError("gone")), False)],
 )
-def test_the_end_of_a_head_is_a_halt_wherever_one_can_be_sent(opened, link, error, halted):
+def test_an_error_ends_in_a_last_halt_unless_the_port_is_lost(opened, link, error, halted):
     head = opened()
     link.polls_fail = [error, ...]
     with pytest.raises(DeviceError, match=str(error).split("(")[0]):
@@ -170,7 +183,7 @@ def silent(*_):
     raise SilentError("it is silent")
 
 
-def test_a_halt_of_a_dead_unit_is_sent_all_the_same_and_told(opened, link):
+def test_a_halt_of_a_dead_unit_is_sent_and_raises(opened, link):
     head = opened()
     link.polls_fail, link.halt_last = [SilentError("it is silent"), ...], silent
     for call in (lambda: ask_again_and_again(head), head.halt):
@@ -199,7 +212,7 @@ def test_a_link_that_hangs_holds_up_neither_a_halt_nor_the_end(opened, link, mon
     release.set()
 
 
-def test_a_mistake_in_the_last_halt_forgets_no_lost_position(opened, link):
+def test_an_exception_in_the_last_halt_keeps_the_marker(opened, link):
     def halt_last(patience):
         raise ValueError("a mistake")
 
@@ -234,7 +247,7 @@ def test_a_start_that_fails_ends_in_a_halt_and_closes_the_port(opened, link, nam
 
 
 @pytest.mark.parametrize("missing", ["poll", "halt_last", "axes", "name", "close"])
-def test_a_link_that_lacks_a_part_is_told_and_closed(opened, link, missing):
+def test_a_link_without_a_required_part_is_refused_and_closed(opened, link, missing):
     class Lacking:
         def __getattr__(self, name):
             if name == missing:
@@ -261,7 +274,7 @@ def test_a_newer_move_takes_the_place_of_one_that_waits(opened, link):
         head.move(STEP, 0.0, wait=True)
 
 
-def test_a_mistake_in_a_link_is_told_with_its_file_and_line_and_halts(opened, link):
+def test_an_exception_in_a_link_halts_and_names_file_and_line(opened, link):
     head = opened()
     link.polls_fail = [ValueError("a mistake"), ...]
     with pytest.raises(DeviceError, match=r"ValueError\('a mistake'\) \(.*test_polled_head\.py:\d+\)$"):

@@ -70,7 +70,7 @@ def test_a_marker_counts_for_its_rig_and_for_its_port(stop_file, port, noted, ot
 
 
 @pytest.mark.parametrize("content", [b"", b"\n", b"\xff\x00\n\x1b[31m\nmany\nlines", b"x" * 100_000])
-def test_whatever_is_in_the_file_it_refuses_in_one_line(stop_file, content):
+def test_any_content_of_a_marker_refuses_in_one_line(stop_file, content):
     lost = PositionLostMarker(USB, stop_file)
     stop_file.parent.mkdir()
     lost.file.write_bytes(content)
@@ -93,7 +93,7 @@ def test_the_stop_file_itself_is_no_lost_position(stop_file):
     assert not refused(PositionLostMarker(USB, stop_file))
 
 
-def test_what_cannot_be_written_or_read_is_told(tmp_path, caplog):
+def test_a_marker_that_cannot_be_written_or_read_is_reported(tmp_path, caplog):
     (tmp_path / "file").touch()
     lost = PositionLostMarker(USB, tmp_path / "file" / "stop")
     assert not refused(lost)

@@ -1,4 +1,4 @@
-"""The PTU-D46's protocol as bytes: what the manuals and other people's units say, and what nobody ever said."""
+"""The PTU-D46's protocol as bytes: answers as manuals and drivers print them, and garbled ones."""
 
 import pytest
 from hypothesis import given, settings
@@ -123,7 +123,7 @@ def test_answers_as_manuals_and_drivers_print_them(read, line, meaning):
 
 
 @pytest.mark.parametrize(("line", "said"), ERRORS)
-def test_errors_are_told_in_the_units_words(line, said):
+def test_errors_keep_the_units_words(line, said):
     rest, events = ptu_protocol.split_events(line)
     reply = ptu_protocol.parse(rest)
     assert (reply.refused, reply.text, events) == (True, said, ())
@@ -215,7 +215,7 @@ def mutated(draw):
 
 @settings(PROPERTY, max_examples=1000)
 @given(mutated())
-def test_whatever_comes_is_understood_or_refused_and_an_integer_alone_is_what_the_bytes_spell(line):
+def test_any_line_is_parsed_or_refused_and_a_bare_integer_equals_its_bytes(line):
     assert set(ptu_protocol.split_events(line)[1]) <= {"P", "T", "D"}
     for read in READERS:
         understood(line, read)

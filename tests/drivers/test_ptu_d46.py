@@ -19,7 +19,7 @@ from tests.support.simulated_clock import SimClock
 
 BYTE = 10 / 9600
 FROM_FAULT_TO_HALT = 0.5  # issue 4's figure [s]
-# What may be sent while nobody moves the head: nothing that moves it, or wears its memory.
+# Commands that neither move the head nor wear its memory.
 HARMLESS = {"ED", "FT", "E", "F", "V", "WP", "C", "CI", "I", "H", "PP", "TP"}
 HARMLESS |= {axis + what for axis in "PT" for what in "RNXLUA"}
 
@@ -43,6 +43,16 @@ def opened(bench, monkeypatch):
 def test_no_port_is_named():
     with pytest.raises(ConfigError, match=r"^hardware\.head\.port: "):
         open_line("", 9600, SimClock())
+
+
+@pytest.mark.parametrize(("port", "exclusive"), [("/dev/ttyUSB0", True), ("socket://host:4000", None)])
+def test_a_port_is_opened_with_time_limits_and_a_device_for_one_program(monkeypatch, port, exclusive):
+    options = {}
+    monkeypatch.setattr(serial, "serial_for_url", lambda name, **given: options.update(given))
+    open_line(port, 9600, SimClock())
+    assert options["exclusive"] is exclusive
+    assert 0 < options["timeout"] < FROM_FAULT_TO_HALT
+    assert 0 < options["write_timeout"] <= FROM_FAULT_TO_HALT
 
 
 CANNOT_OPEN = [
@@ -161,7 +171,7 @@ def mute(bench, says):
 
 
 @pytest.mark.parametrize("what", NO_UNITS)
-def test_what_is_no_usable_unit_is_told(bench, what):
+def test_a_port_without_a_usable_unit_is_an_error(bench, what):
     prepare, said = NO_UNITS[what]
     prepare(bench)
     with pytest.raises(DeviceError, match=said):
@@ -174,7 +184,7 @@ EVENTS = {"P": "pan hit its limit", "T": "tilt hit its limit", "D": "its cable c
 
 @pytest.mark.parametrize("axis", EVENTS)
 @pytest.mark.parametrize("order", ["V", "PU", "H", "C"])
-def test_what_happens_while_it_is_opened_is_not_overheard(bench, axis, order):
+def test_an_event_while_the_unit_is_opened_is_an_error(bench, axis, order):
     """Inside an answer after the greeting; only what was said before that may be left from long ago."""
     bench.unit.scripted = {order: [f"!{axis}*{' 2902' if order == 'PU' else ''}\r\n".encode()]}
     with pytest.raises(PositionLostError, match=EVENTS[axis]):
@@ -200,7 +210,7 @@ NO_PROBES = [
 
 
 @pytest.mark.parametrize(("answers", "kind"), NO_PROBES)
-def test_a_probe_tells_of_no_unit_and_of_one_that_has_not_found_its_limits(opened, answers, kind):
+def test_a_probe_refuses_a_missing_or_uncalibrated_unit(opened, answers, kind):
     opened.unit.scripted = answers
     with pytest.raises(kind, match="PORT"):
         D46Head.probe(CONFIG)
@@ -233,7 +243,7 @@ def test_positions_are_stamped_with_the_time_at_which_the_unit_looked(bench):
             assert bench.loop.snapshot.t == pytest.approx(looked[-2], abs=BYTE / 10)
 
 
-def test_both_axes_are_told_for_one_time(bench):
+def test_a_snapshot_has_both_axes_at_one_time(bench):
     bench.start()
     bench.move(3000, -900, speed=1000)
     bench.until(lambda: bench.unit.position("T") < -100)
@@ -322,7 +332,7 @@ def test_the_newest_move_wins_and_moves_without_end_leave_the_line_to_polls(benc
     assert min(bench.unit.heard.count(order) for order in ("PP", "TP")) >= 40
 
 
-def test_a_refused_move_is_halted_and_told_once(bench):
+def test_a_refused_move_is_halted_and_its_error_raised_once(bench):
     bench.start()
     bench.unit.scripted = {"PP100": [b"! Maximum allowable Pan position is 90\r\n"]}
     bench.move(100, 100)
@@ -381,7 +391,7 @@ def test_a_move_from_before_a_halt_does_not_take_the_place_of_one_from_after(ben
     assert move.error is None
 
 
-def test_a_halted_head_moves_until_it_stands_and_the_same_goal_is_sent_anew(bench):
+def test_after_a_halt_the_same_goal_is_sent_again(bench):
     move = turning(bench)
     request = bench.halt()
     assert bench.until(lambda: request.answered) < 0.02
@@ -527,7 +537,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize("fault", ENDS)
-def test_a_fault_that_ends_it_is_told_and_the_head_is_halted(bench, fault):
+def test_a_fatal_fault_is_named_and_halts_the_head(bench, fault):
     act, kind, said = ENDS[fault]
     move = turning(bench)
     move.wait = True
@@ -562,7 +572,7 @@ def test_a_unit_that_comes_back_was_halted_and_goes_on(bench, wait):
     if wait:
         assert move.error is None
         assert bench.unit.position("P") == 3000
-    else:  # whoever sends without waiting sends again; an old command is not taken up after a silence
+    else:  # a caller that does not wait sends a new command; an old one is not sent again after a silence
         assert "halted" in str(move.error)
         assert bench.unit.position("P") < 1000
         bench.until(lambda: not bench.loop.snapshot.moving)
@@ -597,7 +607,7 @@ def test_a_move_is_not_taken_up_again_after_a_halt(bench):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_whatever_comes_it_ends_in_a_halt_or_goes_on(seed):
+def test_random_answers_end_in_a_halt_or_are_survived(seed):
     rng = random.Random(seed)
     bench = Bench()
     bench.start()

@@ -119,7 +119,7 @@ def test_a_speed_cap_that_the_unit_cannot_keep_is_refused(opened, bench):
     opened(CONFIG, speed_deg_s=1.6)
 
 
-def test_the_error_of_a_move_comes_to_who_waits_or_with_the_next_call(opened, bench):
+def test_a_moves_error_is_raised_by_its_wait_or_by_the_next_call(opened, bench):
     head = opened()
     bench.unit.scripted = {f"PP{n}": [b"! Maximum allowable Pan position is 90\r\n"] for n in (100, 101)}
     with pytest.raises(DeviceError, match="PP100"):
@@ -171,7 +171,7 @@ def test_a_signal_handler_may_halt_whatever_it_interrupts(watched, bench):
     assert len(halted) >= 51
 
 
-def test_who_waits_for_a_move_that_is_halted_may_command_it_again(watched, bench):
+def test_a_halted_move_may_be_commanded_again(watched, bench):
     head, link = watched
     halts = threading.Thread(target=head.halt)
 
@@ -197,7 +197,7 @@ def test_a_closed_head_is_halted(opened, bench):
     head.halt()
 
 
-def test_who_waits_is_told_of_the_end(opened, bench):
+def test_closing_raises_in_a_move_that_waits(opened, bench):
     head = opened()
     bench.unit.stuck = True
     said = []

@@ -42,7 +42,7 @@ class Reset:
         return D46Head.reset(CONFIG, bench.clock, self.safety, stopped)
 
     def after(self, seconds, act):
-        """Something that happens at a time, told by who asks whether the head must stop."""
+        """Make a ``stopped`` that acts after a time [s]."""
         begun = self.bench.clock.now()
         return lambda: act(self.bench) if self.bench.clock.now() > begun + seconds else None
 

@@ -105,7 +105,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_halts_it_and_is_told(stock, fault):
+def test_each_fault_halts_the_head_and_is_named(stock, fault):
     with opened(stock) as head:
         head.move(2.5, 0.0, speed=0.5)
         until(stock.turning)
@@ -122,7 +122,7 @@ def test_each_fault_halts_it_and_is_told(stock, fault):
         assert FAULTS[fault] in fails(lambda: head.move(0.0, 0.0))
 
 
-def test_an_unplugged_line_by_tcp_is_told_and_cannot_be_opened_again():
+def test_a_lost_tcp_line_is_an_error_and_cannot_be_opened_again():
     with D46Unit(tcp=True) as unit:
         with opened(unit) as head:
             unit.faults.set("unplugged")
@@ -131,7 +131,7 @@ def test_an_unplugged_line_by_tcp_is_told_and_cannot_be_opened_again():
 
 
 @pytest.mark.parametrize("fault", ["silence", "half-replies"])
-def test_short_faults_are_got_over(stock, fault):
+def test_short_faults_are_recovered_from(stock, fault):
     with opened(stock) as head:
         for _ in range(3):
             stock.faults.set(fault)
@@ -173,8 +173,8 @@ SIGNALS = (signal.SIGQUIT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)
         *(pytest.param(number, 128 + number, marks=pytest.mark.slow) for number in SIGNALS),
     ],
 )
-def test_a_reset_is_broken_off_by_whatever_ends_it(stock, state_home, how, status):
-    """The emulated unit hears nothing while it resets itself: the operator is told at once."""
+def test_a_stop_or_signal_ends_a_reset(stock, state_home, how, status):
+    """The emulated unit takes no command during its reset; the error says so at once."""
     rig = state_home / "rig.toml"
     rig.write_text(
         f"backend = 'hardware'\n[hardware.head]\nport = '{stock.config.port}'\n[safety]\nstop_file = 'stop'\n"
@@ -203,13 +203,13 @@ def test_a_reset_is_broken_off_by_whatever_ends_it(stock, state_home, how, statu
 
 
 @pytest.mark.parametrize("tcp", [False, True])
-def test_a_harmless_look(tcp):
+def test_a_probe_does_not_move_the_head(tcp):
     with D46Unit(tcp=tcp) as unit:
         assert "unit 0" in D46Head.probe(unit.config)
         assert not unit.turning()
 
 
-def test_the_wrong_baud_is_told(stock):
+def test_the_error_names_a_wrong_baud_rate(stock):
     stock.config = replace(stock.config, baud=19200)
     assert "19200 baud" in fails(lambda: D46Head(stock.config, MonotonicClock()))
 
@@ -234,7 +234,7 @@ NO_PORTS = {
 
 
 @pytest.mark.parametrize("port", NO_PORTS)
-def test_what_is_no_port(tmp_path, port):
+def test_an_invalid_port_is_an_error_that_names_it(tmp_path, port):
     said, port = NO_PORTS[port], port.replace("FOLDER", str(tmp_path))
     (tmp_path / "file").touch()
     with pytest.raises(DeviceError, match=said) as caught:

@@ -73,7 +73,9 @@ class FakeLink:
             return Setting("range", value, *self.range, readonly=readonly)
         if name == "datetime":  # the camera's clock goes on
             return Setting("date", value + 1.0, readonly=readonly)
-        return Setting("switch" if name == "capture" else "text", value, readonly=readonly)
+        if name == "capture":
+            return Setting("switch", value, choices=("0", "1"), readonly=readonly)
+        return Setting("text", value, readonly=readonly)
 
     def put(self, name, value):
         self._do("put", name, value)
