@@ -53,6 +53,7 @@ PACKAGES = ("numpy", "scipy", "mujoco", "opencv-python-headless", "matplotlib", 
 LINEAR_ALGEBRA = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 ONE_THREAD = dict.fromkeys((*LINEAR_ALGEBRA, "LP_NUM_THREADS"), "1")
 TALLY = "COTARGET_TALLY"  # file to which each rendered image adds a byte; see `cotarget.sim.render.opengl`
+SHARED = "COTARGET_SHARED"  # folder of what the local workers of a run share; see `experiments.following.own_rig`
 ANSWER_S = 10.0  # timeout of the scheduler's answer [s]
 QUIET = logging.CRITICAL + 10  # Dask's log is silent, because each failure is reported in one line
 DIED = "its process died; is there memory enough?"
@@ -415,10 +416,11 @@ def on_dask(processes: int, scheduler: str | None) -> Iterator[Run]:
             # A worker has one job at a time, so that its death concerns this job alone.
             rules = {"distributed.scheduler.worker-saturation": 1.0, "distributed.scheduler.allowed-failures": 1}
             stack.enter_context(dask.config.set(rules))
+            shared = stack.enter_context(tempfile.TemporaryDirectory(prefix="cotarget-shared-"))
             with interrupts_kept_from_children():
                 cluster = distributed.LocalCluster(
                     n_workers=processes, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=0,
-                    dashboard_address="127.0.0.1:0", silence_logs=QUIET, env=ONE_THREAD,
+                    dashboard_address="127.0.0.1:0", silence_logs=QUIET, env=ONE_THREAD | {SHARED: shared},
                 )  # fmt: skip
             client = stack.enter_context(distributed.Client(stack.enter_context(cluster)))
         else:

@@ -28,6 +28,7 @@ from cotarget.safety.safe_rig import guard
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Row, Settings
+from experiments.following.own_rig import RigText, calibrated_rig
 from experiments.tables import grouped, outside, rms, spread
 
 # Goals for each head's figures, least and largest; with an ideal head nothing is rounded.
@@ -63,7 +64,8 @@ def one(settings: ZoomRangeSettings, seed: int) -> list[Row]:
         config = RigConfig(sim=sim)
         world = SimWorld(config)
         with guard(world.rig, config.safety) as rig:
-            calibration = calibrate(rig, config.board, seed=seed)
+            # With steps it is the default rig.
+            calibration = calibrated_rig(RigText(), seed) if HEADS[head] else calibrate(rig, config.board, seed=seed)
             reach, truth, exact = reach_of(rig), world.truth(), true_calibration(world, stops=FOCAL_LENGTHS)
             for i, nominal in enumerate(np.geomspace(*reach.focal_px, FOCAL_LENGTHS)):
                 judged = functools.partial(

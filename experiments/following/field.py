@@ -13,7 +13,6 @@ from typing import Annotated
 from annotated_types import Gt, Le
 
 from cotarget.calibration import Calibration
-from cotarget.calibration.calibrate import calibrate
 from cotarget.config import RigConfig, TargetProfile
 from cotarget.control.selection import TargetSelector
 from cotarget.detection import Detector, make_detector
@@ -26,7 +25,7 @@ from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import Settings
-from experiments.following.own_rig import OwnRig, RigText
+from experiments.following.own_rig import OwnRig, RigText, calibrated_rig
 from experiments.following.wide_view import WideView, open_on
 from experiments.paper.paper_loop import Follow
 
@@ -50,19 +49,14 @@ class OwnRigInField(OwnRig, FieldSettings):
 
 
 def calibrated(settings: FieldSettings) -> Calibration:
-    """Calibrate the settings' rig, from rendered boards or exactly, once in a process."""
+    """Calibrate the settings' rig, from rendered boards or exactly."""
     rig = settings.text if isinstance(settings, OwnRig) else RigText()
-    return _calibrated(settings.calibrated, settings.seed_base, rig)
+    return calibrated_rig(rig, settings.seed_base) if settings.calibrated else _exact(rig, settings.seed_base)
 
 
 @functools.cache
-def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
-    config = rig.config("indoor", (), seed)
-    if not from_boards:
-        return true_calibration(SimWorld(config, rendered=()))
-    world = SimWorld(config)
-    with guard(world.rig, config.safety) as safe:
-        return calibrate(safe, config.board, seed=config.sim.seed)
+def _exact(rig: RigText, seed: int) -> Calibration:
+    return true_calibration(SimWorld(rig.config("indoor", (), seed), rendered=()))
 
 
 def held(

@@ -1,17 +1,26 @@
-"""A user's own rig in an experiment: offsets, cameras and head of a rig.toml in place of the default ones.
+"""The rig of an experiment: the default one, or offsets, cameras and head of a user's rig.toml; and its calibration.
 
 The experiment sets scene, seed, targets, models and paths itself; everything else is taken from the file.
 """
 
 import dataclasses
+import fcntl
 import functools
+import hashlib
+import os
+import pickle
 from dataclasses import dataclass
 from pathlib import Path
 
 from cotarget.backends import load_config
+from cotarget.calibration import Calibration
+from cotarget.calibration.calibrate import calibrate
 from cotarget.config import RigConfig, read_text
 from cotarget.errors import ConfigError
-from experiments.engine import Settings
+from cotarget.files import write_atomically
+from cotarget.safety.safe_rig import guard
+from cotarget.sim.world import SimWorld
+from experiments.engine import SHARED, Settings
 
 
 @dataclass(frozen=True)
@@ -31,6 +40,26 @@ class RigText:
         config = load_config(self.path, self.text) if self.path else RigConfig()
         sim = dataclasses.replace(config.sim, scene=scene, targets=targets, seed=seed, models={}, paths={})
         return dataclasses.replace(config, sim=sim)
+
+
+@functools.cache
+def calibrated_rig(rig: RigText, seed: int) -> Calibration:
+    """Calibrate a rig from rendered boards indoors; experiments of one run on this machine share the result."""
+    if (folder := os.environ.get(SHARED)) is None:
+        return _calibrate(rig, seed)
+    path = Path(folder) / f"{hashlib.sha256(repr((rig, seed)).encode()).hexdigest()}.pickle"
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # wait for a process that is calibrating the same rig
+        if not path.exists():
+            write_atomically(path, pickle.dumps(_calibrate(rig, seed)))
+    found: Calibration = pickle.loads(path.read_bytes())
+    return found
+
+
+def _calibrate(rig: RigText, seed: int) -> Calibration:
+    config = rig.config("indoor", (), seed)
+    with guard(SimWorld(config).rig, config.safety) as opened:
+        return calibrate(opened, config.board, seed=seed)
 
 
 @dataclass(frozen=True)
