@@ -88,7 +88,7 @@ def test_an_environment_in_a_vector_does_what_it_does_alone(opened):
     pytest.param(FOLLOW, STILL, {"target": "book", "observation": "images", "seconds": 1.0},
                  marks=[pytest.mark.slow, pytest.mark.render]),
 ])  # fmt: skip
-def test_other_environments_and_rigs_do_so_too(field, name, action, chosen):
+def test_schedule_and_an_own_rig_in_a_vector_do_what_they_do_alone(field, name, action, chosen):
     how, seconds = ("async", 0.4) if name == FOLLOW else ("sync", 2.0)
     context = {"vector_kwargs": {"context": "spawn"}} if how == "async" else {}
     vector = gymnasium.make_vec(name, num_envs=2, vectorization_mode=how, rig=field, **context, **chosen)
@@ -97,7 +97,7 @@ def test_other_environments_and_rigs_do_so_too(field, name, action, chosen):
     assert first == [(flat(o).tolist(), r, i["box_wide"].tolist()) for o, r, i in alone]
 
 
-def test_a_vector_begins_anew_where_an_episode_ends():
+def test_a_vector_starts_a_new_episode_where_one_ends():
     vector = gymnasium.make_vec(FOLLOW, num_envs=2, vectorization_mode="sync", target="book", seconds=0.2)
     vector.reset(seed=3)
     ends = [vector.step(np.stack([STILL, STILL]))[3].tolist() for _ in range(7)]
@@ -107,7 +107,7 @@ def test_a_vector_begins_anew_where_an_episode_ends():
 
 # ---------------------------------------------------------------- seeds
 @pytest.mark.parametrize("make", [Follow, Schedule])
-def test_the_same_seed_gives_the_same_episode_and_no_seed_another(field, make):
+def test_the_same_seed_gives_the_same_episode_and_no_seed_a_different_one(field, make):
     env = make("bird", rig=field, seconds=1.0)
     env.action_space.seed(1)
     actions = [env.action_space.sample() for _ in range(20)]
@@ -160,7 +160,7 @@ def test_head_and_lens_go_where_the_action_says(field):
     env.close()
 
 
-def test_tracks_are_what_the_tracker_knows(field):
+def test_track_features_follow_the_true_box(field):
     """Without noise: where the truth is, as large, and as fast as the box has moved in the last half second."""
     env = Follow("person", rig=field, seconds=5.0, noise=NO_NOISE)
     told = run(env, lambda _: STILL, seed=1)
@@ -258,7 +258,7 @@ def test_the_truth_is_in_info_alone(field, make, name, action, steps):
     *((lambda given=given: Follow().reset(options=given), f"options: {given!r}")
       for given in ({"wind": 3}, 3, np.zeros(3))),
 ])  # fmt: skip
-def test_what_makes_no_sense_is_refused_in_a_line(make, named):
+def test_invalid_arguments_are_refused_in_one_line(make, named):
     with pytest.raises(CotargetError) as caught:
         make()
     assert str(caught.value).startswith(named)
@@ -271,7 +271,7 @@ def test_what_makes_no_sense_is_refused_in_a_line(make, named):
     (lambda field: Schedule("bird", rig=field, seconds=1.0), 0,
      [SLOTS, -1, 0.5, math.nan, np.zeros((40, 40)), "first", None]),
 ], ids=["follow", "schedule"])  # fmt: skip
-def test_actions_that_are_none_are_refused(field, make, good, wrong):
+def test_invalid_actions_are_refused(field, make, good, wrong):
     env = make(field)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(good)

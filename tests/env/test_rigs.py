@@ -28,7 +28,7 @@ def simulated(config=DEFAULT_RIG, **changes):
 
 
 # ---------------------------------------------------------------- gymnasium
-def test_a_rig_made_in_python_goes_where_arguments_go(field):
+def test_a_rig_made_in_python_can_be_pickled_and_remade(field):
     assert set(pickle.loads(pickle.dumps(RigConfig())).targets) == set(copy.deepcopy(RigConfig()).targets)
     env = gymnasium.make(FOLLOW, rig=field, target="book", seconds=0.2)
     assert env.spec is not None
@@ -60,7 +60,7 @@ def test_an_action_stands_for_a_place_within_the_soft_limits(narrow):
     env.close()
 
 
-def test_the_pipeline_keeps_to_the_actions_that_there_are(narrow):
+def test_the_pipelines_actions_stay_within_the_action_space(narrow):
     """Also where the target is beyond the head's limits."""
     env = Follow("bird", rig=narrow, seconds=3.0)
     policy, actions = PipelinePolicy(env), []
@@ -75,7 +75,7 @@ def test_the_pipeline_keeps_to_the_actions_that_there_are(narrow):
     env.close()
 
 
-def test_nobody_is_scheduled_beyond_the_soft_limits(narrow):
+def test_schedule_keeps_the_head_within_the_soft_limits(narrow):
     env, pans = Schedule("bird", rig=narrow, seconds=6.0), []
 
     def first(_):
@@ -98,7 +98,7 @@ def test_nobody_is_scheduled_beyond_the_soft_limits(narrow):
     ({"fixed": {"latency_s": 1.5}}, "rig: sim.fixed.latency_s: makes a frame 1.5 s late; the pipeline waits for 1 s"),
     ({"zoom": {"latency_s": 1.5}}, "rig: sim.zoom.latency_s: makes a frame 1.5 s late; the pipeline waits for 1 s"),
 ])  # fmt: skip
-def test_a_rig_that_cannot_be_or_is_too_slow_is_refused_in_a_line(change, said):
+def test_an_impossible_or_too_slow_rig_is_refused_in_one_line(change, said):
     ((part, values),) = change.items()
     rig = simulated(**{part: dataclasses.replace(getattr(DEFAULT_RIG.sim, part), **values)})
     rig = dataclasses.replace(rig, safety=SafetyConfig(watchdog_s=3.0, max_frame_age_s=9.0))
@@ -109,7 +109,7 @@ def test_a_rig_that_cannot_be_or_is_too_slow_is_refused_in_a_line(change, said):
 
 
 @pytest.mark.parametrize("part", ["fixed", "zoom"])
-def test_a_camera_that_is_just_not_too_slow_is_waited_for(field, part):
+def test_the_slowest_allowed_camera_works(field, part):
     camera = dataclasses.replace(getattr(field.sim, part), rate_hz=1.0, latency_s=1.0)
     rig = dataclasses.replace(
         simulated(field, **{part: camera}), safety=SafetyConfig(watchdog_s=3.0, max_frame_age_s=9.0)
@@ -129,7 +129,7 @@ def test_a_camera_that_is_just_not_too_slow_is_waited_for(field, part):
     ("<light", '<geom type="box" pos="0 15 5" size="20 .1 20" group="3"/><light', None),  # that is not drawn
     ("<light", '<geom type="box" pos="0 15 -9" size="20 .1 10"/><light', None),  # that is low
 ])  # fmt: skip
-def test_a_scene_in_which_the_ways_cannot_be_seen_is_refused(field, tmp_path, old, new, seen):
+def test_a_scene_that_hides_the_paths_is_refused(field, tmp_path, old, new, seen):
     (tmp_path / "other.xml").write_text(FIELD.replace(old, new))
     rig = simulated(field, scene=str(tmp_path / "other.xml"))
     if seen is None:
@@ -147,7 +147,7 @@ def test_indoors_there_is_room_for_a_book_and_not_for_a_bird():
             make("bird", rig=simulated(scene="indoor"))
 
 
-def test_a_scene_that_is_none_is_refused_at_once(tmp_path):
+def test_an_invalid_scene_is_refused_at_construction(tmp_path):
     (tmp_path / "bare.xml").write_text("<mujoco/>")
     for scene, said in (("moon", "unknown scene 'moon'"), (str(tmp_path / "bare.xml"), "has no site 'fixed_mount'")):
         with pytest.raises(ConfigError, match=said):

@@ -49,7 +49,7 @@ def exact():
 
 # ---------------------------------------------------------------- the wide view, once
 @pytest.mark.render
-def test_what_was_recorded_is_what_is_seen():
+def test_a_recorded_view_gives_the_same_frames_and_detections():
     config = hold_config("book", 2)
     target = config.target("book")
     view = record(config, target, 0.04)
@@ -77,7 +77,7 @@ def test_a_delay_is_shared_as_in_the_field():
     assert delay.delayed(config, 0.2).sim.head.command_delay_s == pytest.approx(0.08)
 
 
-def test_who_does_not_predict_is_behind_by_speed_times_delay(exact, monkeypatch):
+def test_without_prediction_the_offset_is_speed_times_delay(exact, monkeypatch):
     """1.5 m/s and 0.2 s are 0.3 m, of 1.75 m that are 300 px large: 51 px of 640, and a frame or two more on the way.
 
     The way across the line of sight is shorter by some cosine.
@@ -94,7 +94,7 @@ def test_who_does_not_predict_is_behind_by_speed_times_delay(exact, monkeypatch)
     delay.plot(rows, Figure())
 
 
-def test_how_many_times_is_of_medians_at_one_delay():
+def test_the_gain_of_prediction_is_a_ratio_of_medians_at_one_delay():
     def row(name, delay_s, predict, closed_loop, offset):
         return {"target": name, "delay_s": delay_s, "predict": predict, "closed_loop": closed_loop, "tpo_width": offset}
 
@@ -162,7 +162,7 @@ def test_the_whole_loop_does_not_oscillate_however_late_it_is(exact, delay_s):
 
 
 # ---------------------------------------------------------------- five targets
-def test_good_seconds_are_those_that_rows_tell(exact):
+def test_good_seconds_agree_with_the_rows(exact):
     config = hold_config("person", 1)
     target, how = config.target("person"), FollowSettings(closed_loop=False)
     view = seen_well(config, target, 4.0)
@@ -174,7 +174,7 @@ def test_good_seconds_are_those_that_rows_tell(exact):
 
 
 @pytest.mark.slow
-def test_of_five_who_had_a_second_is_served(exact, monkeypatch):
+def test_a_target_with_one_good_second_is_served(exact, monkeypatch):
     monkeypatch.setattr(five_targets, "record", seen_well)
     settings = five_targets.FiveSettings(kinds=("person",), seconds=3.6, closed_loop=False, calibrated=False)
     rows = five_targets.one(settings, 0)
@@ -206,7 +206,7 @@ def test_the_best_policy_is_put_over_the_first():
 
 # ---------------------------------------------------------------- dead zone
 @pytest.mark.slow
-def test_a_dead_zone_spares_the_head_that_looks_at_a_book(exact, monkeypatch):
+def test_the_deadband_saves_commands_on_a_book(exact, monkeypatch):
     monkeypatch.setattr(dead_zone, "record", seen_well)
     settings = dead_zone.DeadZoneSettings(targets=("book",), seconds=6.0, closed_loop=False, calibrated=False)
     rows = dead_zone.one(settings, 0)
@@ -217,7 +217,7 @@ def test_a_dead_zone_spares_the_head_that_looks_at_a_book(exact, monkeypatch):
     assert summary["book"]["commands_per_min"]["without"]["median"] == pytest.approx(1500, rel=0.02)
 
 
-def test_with_a_dead_zone_over_without():
+def test_ratios_with_the_deadband_over_without():
     def row(way, commands, reversals, offset):
         return {
             "target": "book",
@@ -291,7 +291,7 @@ def test_each_cause_alone(still):
     assert steps == pytest.approx(math.hypot(pan + 0.03, tilt), rel=0.2)
 
 
-def test_a_chance_passes_while_the_target_is_not_seen(exact, monkeypatch):
+def test_a_shot_is_skipped_while_the_target_is_not_detected(exact, monkeypatch):
     """Chances come at 3.0, 3.8, 4.6 and 5.4 s, and from 4.3 s on nothing is detected any more."""
 
     class Blinded(TruthDetector):

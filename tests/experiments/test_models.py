@@ -108,7 +108,7 @@ def test_zeros_set_on_one_target_make_every_model_right_there():
     assert 1e-5 < scattered < 5e-3
 
 
-def test_scatter_is_as_large_as_it_is_told():
+def test_scatter_has_the_given_standard_deviation():
     rng = np.random.default_rng(1)
     off = [scattered(BESIDE.gamma, 0.02, np.radians(1.0), rng) for _ in range(500)]  # which tell it to 3 %
     shifts = np.array([T.translation - BESIDE.gamma.translation for T in off])
@@ -119,7 +119,7 @@ def test_scatter_is_as_large_as_it_is_told():
     assert 2e-4 < np.sqrt(np.mean(many**2)) < 4e-3
 
 
-def test_rigs_are_mounted_as_told():
+def test_mounted_rigs_have_the_given_baseline_and_angles():
     rigs = [mounted(np.random.default_rng(seed), 1.5) for seed in range(100)]
     baselines = np.array([np.linalg.norm(rig.gamma.inv().translation) for rig in rigs])
     assert baselines == pytest.approx(1.5)
@@ -172,7 +172,7 @@ def test_of_depths_and_baselines_with_the_same_reach_the_worst_counts(first):
     assert [float(v[0]) for v in regimes.ratios(rows, "exact").values()] == pytest.approx([40.0, 4.0, 9.0])
 
 
-def test_how_far_away_who_ignores_the_offset_has_a_target():
+def test_reach_is_depth_over_baseline_or_from_the_zeros_depth():
     assert regimes.reach(20.0, 0.4) == pytest.approx(50.0)
     assert regimes.reach(20.0, 0.4, 50.0) == pytest.approx(1 / (0.4 * 0.03))
     assert regimes.reach(50.0, 0.4, 50.0) == math.inf
@@ -237,7 +237,7 @@ def test_the_exact_range_is_exact_and_the_shortcut_worse_the_farther_off_the_axi
     assert len(wrong) == 2
 
 
-def test_a_grid_that_has_no_target_at_20_degrees_tells_nothing_of_them():
+def test_a_grid_without_targets_at_20_degrees_gives_nan_there():
     """Its corners are 25 degrees and more off the axis."""
     settings = replace(shortcut.SETTINGS, depths=(10.0,), grid=(2, 2), near=8, rigs=("mounted",))
     rows = shortcut.one(settings, 0)
@@ -270,7 +270,7 @@ def test_the_worked_examples_rig_errs_as_the_worked_example_does():
         assert 7155 * math.tan(looking_off(truth, x, q)[0]) == pytest.approx(px, abs=0.1)
 
 
-def test_how_the_error_grows_is_read_from_the_rows():
+def test_exponents_are_fitted_to_the_rows():
     rows = [
         {"noise_px": noise, "placements": n, "reached_px": 3.0 * noise * n**-0.5}
         for noise in (0.02, 0.1, 0.5)
@@ -283,7 +283,7 @@ def test_how_the_error_grows_is_read_from_the_rows():
     assert calibration_budget.exponents(of_one_number) == pytest.approx((1.0, math.nan), nan_ok=True)
 
 
-def test_a_calibration_is_to_err_as_theory_and_it_itself_have_it():
+def test_missed_compares_errors_with_theory_and_prediction():
     right = {"exponent_noise": 1.0, "exponent_placements": -0.6, "reached_over_predicted": 1.0}
     assert calibration_budget.missed(right) == []
     said = calibration_budget.missed(right | {"exponent_noise": 0.5})

@@ -38,7 +38,7 @@ def test_a_course_leads_by_its_velocity():
     assert course.at(9.0)[0] == pytest.approx((1.0, 0.0))
 
 
-def test_a_piece_of_a_target_tells_no_size():
+def test_a_clipped_sighting_gives_no_size():
     course = Course(BOOK, 0.5)
     course.saw(Sighting(0.0, 0.0, 0.0, (0.02, 0.01), False), 700.0)
     course.saw(Sighting(STEP, 0.0, 0.0, (0.005, 0.01), True), 700.0)
@@ -72,7 +72,7 @@ def test_a_scan_sees_all_that_the_wide_camera_does(size):
     assert len(poses) == SCAN_POSES  # and no more than that
 
 
-def test_a_run_whose_clock_never_starts_leaves_the_others_their_figures():
+def test_a_run_without_a_start_does_not_change_the_other_figures():
     """A person is not wholly in view yet after the least time that can be asked for."""
     rows = [
         {"seed": seed, "target": "person", "way": "pair"} | single_ptz.figures(judged, "pair")
@@ -109,14 +109,14 @@ def looked(world, until, seconds):
     return modes, sent, field
 
 
-def test_who_sees_nothing_scans_all_the_field_again_and_again(world):
+def test_without_detections_the_camera_scans_the_field_repeatedly(world):
     modes, sent, field = looked(world, 0.0, 8.0)
     assert {mode for _, mode, _ in modes} == {"scanning"}
     assert sorted(sent[: len(field)]) == sorted(field)
     assert sent[len(field) : 2 * len(field)] == sent[: len(field)]
 
 
-def test_who_loses_its_target_zooms_out_searches_there_and_then_scans(world):
+def test_after_losing_its_target_the_camera_zooms_out_searches_and_scans(world):
     lost = 3.0
     modes, sent, field = looked(world, lost, lost + SEARCH_S + 2.0)
     by_time = {t: mode for t, mode, _ in modes}
@@ -155,7 +155,7 @@ def test_the_picture_moves_when_the_head_does(world):
     assert shaken.detect(Frame(image, 1.3)) == []
 
 
-def test_until_the_clock_starts_nobody_looks_and_then_both_from_the_same_place():
+def test_both_ways_start_from_the_same_pose_without_a_search():
     runs = [single_runs.held(way, "person", 1, 5.0, 0.05) for way in single_runs.WAYS]
     begin = [next(i for i in range(len(rows)) if single_runs.begun(rows[: i + 1])) for rows in runs]
     assert begin[0] == begin[1] > 40  # 2 s of 25 frames, and until it is wholly in view
@@ -187,7 +187,7 @@ class Once:
         return self._finder.detect(frame) if self.asked == 1 else []
 
 
-def test_what_is_seen_once_is_not_believed(world):
+def test_a_single_detection_is_not_confirmed(world):
     truth, calibration = world.truth(), true_calibration(world)
     field = scan_of(world.rig, calibration)
     detector = Once(Outlines(truth, still=True))

@@ -48,6 +48,9 @@ def test_hand_worked_moves():
     assert trapezoid(3, 1, 0, 1, 1, 2)[-1] == pytest.approx((3, 1, 0, 0))
     # Running away from the goal: 0.5 s to stop 0.25 beyond, then back 0.25 in 2 sqrt(0.125) s.
     assert trapezoid(0, 0, 1, 0, 5, 2)[-1][0] == pytest.approx(0.5 + 2 * math.sqrt(0.125))
+    # Faster than a new limit, either way: 1 s and 1.5 rad to slow down to it, 8 s even, 1 s and 0.5 rad to brake.
+    for way in (1, -1):
+        assert trapezoid(0, 0, 2 * way, 10 * way, 1, 1)[-1] == pytest.approx((10.0, 10 * way, 0, 0))
 
 
 def test_backlash_is_a_hysteresis():

@@ -11,7 +11,7 @@ from cotarget.board import board_points
 from cotarget.calibration.corners import find_corners
 from cotarget.config import BoardConfig, SimZoomCamera, parse_config
 from cotarget.geometry import pose
-from cotarget.sim.render.optics import TrueLens
+from cotarget.sim.render.optics import TrueLens, fold
 from cotarget.sim.world import SimWorld
 from cotarget.sim.zoom_lens import optics_at
 
@@ -235,3 +235,12 @@ def test_a_lens_is_undone_however_much_it_stretches(k1):
     K = np.array([[686.0, 0.0, 325.0], [0.0, 684.0, 239.0], [0.0, 0.0, 1.0]])
     back = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(distortion))[0][:, 0]
     np.testing.assert_allclose(back, pixels, atol=ROUNDING_PX)
+
+
+@pytest.mark.parametrize("k", [(-0.2, 0.0, 0.0), (-0.1, -0.05, 0.0), (0.2, -0.1, -0.02)], ids=str)
+def test_a_lens_folds_back_where_its_radius_is_largest(k):
+    k1, k2, k3 = k
+    r = np.linspace(0.0, 2.0, 200_001)
+    radius = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
+    assert fold((k1, k2, 0.0, 0.0, k3)) == pytest.approx(r[np.argmax(radius)], abs=2e-5)
+    assert fold((abs(k1), abs(k2), 0.0, 0.0, abs(k3))) == math.inf

@@ -34,7 +34,7 @@ def world(name, seed, **effects):
 
 @pytest.mark.parametrize("effects", [{}, {"distortion": False}], ids=["distorted", "plain"])
 @pytest.mark.parametrize("name", ["book", "person", "bird"])
-def test_boxes_are_the_truths_but_for_a_little(name, effects):
+def test_boxes_agree_with_the_truth_within_tolerance(name, effects):
     w = world(name, 3, **effects)
     truth, outlines = w.truth(), Outlines(w.truth(), still=True)
     compared = 0
@@ -88,7 +88,7 @@ def test_a_box_that_is_cut_shows_in_part():
 
 
 @pytest.mark.parametrize(("x", "ground", "hidden"), [(-3.0, 0.0, False), (0.0, 0.0, True), (-3.0, 1.5, True)])
-def test_what_hides_a_target_is_noticed(tmp_path, x, ground, hidden):
+def test_an_occluder_lowers_visibility(tmp_path, x, ground, hidden):
     """A wall aside, a wall before, and a floor above the book."""
     scene = tmp_path / "wall.xml"
     scene.write_text(WALL.format(x=x, ground=ground))

@@ -58,7 +58,7 @@ def extents(spec):
 
 
 @pytest.mark.parametrize(("name", "scene"), CASES)
-def test_comes_in_after_the_background_is_learnt_and_stays(name, scene):
+def test_targets_enter_after_the_background_is_learnt_and_stay(name, scene):
     for seed in SEEDS:
         points = positions(make(name, scene, seed))
         across, up = bearings(points, scene)
@@ -119,7 +119,7 @@ def test_motion_is_smooth(name, scene, where):
 
 
 @pytest.mark.parametrize(("name", "scene"), CASES)
-def test_goes_round_for_as_long_as_anybody_looks(name, scene):
+def test_loops_repeat_for_ever(name, scene):
     path = make(name, scene).path
     begin, end = path.lap
     for t in (begin + 1.0, begin + 0.7 * (end - begin)):

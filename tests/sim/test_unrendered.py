@@ -31,7 +31,7 @@ def config(**sim):
 
 
 @pytest.mark.render
-def test_times_head_lens_and_truth_are_as_ever():
+def test_times_head_lens_and_truth_do_not_depend_on_rendering():
     (seen, *_), (blind, fixed, zoom) = drive(SimWorld(config())), drive(SimWorld(config(), rendered=()))
     assert seen == blind
     for frame in (fixed, zoom):
@@ -56,7 +56,7 @@ def test_no_opengl_is_opened_for_no_picture(monkeypatch):
     drive(SimWorld(config(), rendered=()))
 
 
-def test_a_closed_rig_shows_nothing_more_and_can_be_closed_again():
+def test_a_closed_rig_refuses_reads_and_can_be_closed_again():
     w = SimWorld(config(), rendered=())
     with guarded(w.rig, SafetyConfig()) as rig:
         rig.head.move(0.1, 0.0)

@@ -47,7 +47,7 @@ def test_without_clutter_and_indoors_nothing_moves(scene, clutter):
         assert false_blobs_a_minute(w, 3.0) == 0
 
 
-def test_everything_that_shall_move_does():
+def test_sky_treetops_meadow_and_light_all_change():
     """Sky, treetops and meadow each look different two seconds later, and the whole picture's light changes."""
     with (w := world(effects={"all": False, "clutter": True})).rig:
         lens = w.truth().fixed_lens
@@ -69,7 +69,7 @@ def test_frames_are_a_function_of_seed_and_time_alone():
         assert (third.expose("fixed", 5, 4.0) != image).mean() > 0.1
 
 
-def test_another_seed_is_another_wind():
+def test_another_seed_gives_another_wind():
     """Noise and the trees are others too: only when the treetops go to and fro tells of the wind."""
     ways = []
     for seed in (3, 3, 4):
@@ -99,7 +99,7 @@ def test_it_is_off_by_default():
     assert not SimEffects().clutter
 
 
-def test_a_scene_of_ones_own_sways_where_it_says_so(tmp_path):
+def test_crowns_of_a_users_scene_sway(tmp_path):
     scene = tmp_path / "own.xml"
     scene.write_text(
         """<mujoco><statistic extent="40" center="0 25 1"/><visual><map znear="0.00125" zfar="6"/></visual>
