@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from cotarget.config import RigConfig, SimCamera, SimConfig, SimEffects, SimHead, SimZoomCamera
+from cotarget.geometry import pose
 from cotarget.sim.devices import SimClock, SimPanTilt, SimStream, SimZoomStream, head_drive, lens_drive, rig_spec
 from cotarget.sim.motion import HISTORY_S, Axis, trapezoid
+from cotarget.sim.world import SimWorld
 
 ROUNDING = 1e-9
 AGED = 1.05  # memory after ten minutes over that after two; the history's length varies by a command or two
@@ -71,6 +73,33 @@ def test_a_command_takes_effect_after_its_delay():
     assert drive.angles_at(clock.now()) == (0, 0)
     clock.sleep_until(0.06)
     assert drive.angles_at(clock.now())[0] > 0
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.04])
+def test_the_lens_starts_after_the_heads_command_delay(delay_s):
+    config = RigConfig(sim=SimConfig(scene="indoor", targets=(), head=SimHead(command_delay_s=delay_s)))
+    world = SimWorld(config, rendered=())
+    with world.rig as rig:
+        assert rig.spec.zoom.delay_s == rig.spec.head.delay_s == delay_s
+        shortest = rig.zoom.focal_range[0]
+        rig.zoom.zoom(3 * shortest)
+        rig.clock.sleep_until(0.039)
+        assert (rig.zoom.state().focal_px > shortest) == (delay_s == 0.0)
+        rig.clock.sleep_until(0.1)
+        assert rig.zoom.state().focal_px > shortest
+
+
+def test_a_board_swings_about_its_pose_from_the_command_on():
+    """By 0.15 m along its x axis, with a period of 1.7 s."""
+    world = SimWorld(RigConfig(sim=SimConfig(scene="indoor", targets=())), rendered=())
+    with world.rig as rig:
+        rig.clock.sleep_until(1.3)
+        rig.board.swing(pose([0.2, -0.1, 3.0], [0, 0, 0]))
+        rig.clock.sleep_until(4.0)
+        truth = world.truth()
+        for part, aside in ((0.0, 0.0), (0.25, 0.15), (0.5, 0.0), (0.75, -0.15)):
+            x_world = truth.set_bodies(1.3 + part * 1.7).body("rig/board").xpos
+            assert truth.T_world_fixed.inv().apply(x_world) == pytest.approx([0.2 + aside, -0.1, 3.0])
 
 
 def stream(**changes):
