@@ -270,7 +270,7 @@ class WebDevice:
     def __init__(self, url: str, user: str, password: str, silence_s: float) -> None:
         self.url = url
         self._password = password
-        self._asked: socket.socket | None = None  # of the response that is being read
+        self._socket: socket.socket | None = None  # of the response that is being read
         self._ended = False
         self._lock = threading.Lock()
         self._httpx = _import_httpx()
@@ -294,10 +294,10 @@ class WebDevice:
         """Break off a request that another thread reads, and refuse further requests."""
         with self._lock:
             self._ended = True
-            if self._asked is not None:
+            if self._socket is not None:
                 # The device may have closed it already.
                 with contextlib.suppress(OSError):
-                    self._asked.shutdown(socket.SHUT_RDWR)
+                    self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Release the HTTP client."""
@@ -310,9 +310,9 @@ class WebDevice:
         Raises:
             DeviceError: the device cannot be reached, or does not speak HTTP.
         """
-        with self._understood():
+        with self._one_line_errors():
             response = self._client.send(self._client.build_request("GET", path, params=query), stream=True)
-        with contextlib.closing(response), self._held(response):
+        with contextlib.closing(response), self._registered(response):
             yield response
 
     def text(self, path: str, query: dict[str, str]) -> str | None:
@@ -341,7 +341,7 @@ class WebDevice:
         Raises:
             DeviceError: the device broke off or stopped sending.
         """
-        with self._understood():
+        with self._one_line_errors():
             yield from response.iter_raw()
 
     def quote(self, text: str) -> str:
@@ -352,20 +352,20 @@ class WebDevice:
         return text if len(text) <= LONGEST_QUOTE else f"{text[:LONGEST_QUOTE]}..."
 
     @contextlib.contextmanager
-    def _held(self, response: "httpx.Response") -> Iterator[None]:
+    def _registered(self, response: "httpx.Response") -> Iterator[None]:
         """Register a response so that `end` can break it off."""
         with self._lock:
             if self._ended:
                 raise DeviceError(f"{self.url} is closed")
-            self._asked = response.extensions["network_stream"].get_extra_info("socket")
+            self._socket = response.extensions["network_stream"].get_extra_info("socket")
         try:
             yield
         finally:
             with self._lock:
-                self._asked = None
+                self._socket = None
 
     @contextlib.contextmanager
-    def _understood(self) -> Iterator[None]:
+    def _one_line_errors(self) -> Iterator[None]:
         """Turn httpx's exceptions into a DeviceError of one line."""
         httpx = self._httpx
         # httpx raises the last three for authentication challenges that it cannot parse.

@@ -243,6 +243,15 @@ def test_positions_are_stamped_with_the_time_at_which_the_unit_looked(bench):
             assert bench.loop.snapshot.t == pytest.approx(looked[-2], abs=BYTE / 10)
 
 
+def test_a_position_is_dated_in_the_middle_of_the_units_pause(bench):
+    """Between the command's last byte and the answer's first, which comes 20 ms later."""
+    bench.start()
+    bench.port.latency = 0.02
+    (poll,) = bench.link.poll()
+    sent, order = bench.port.sent[-1]
+    assert poll.t == pytest.approx(sent + len(order) * BYTE + 0.01, abs=BYTE / 10)
+
+
 def test_a_snapshot_has_both_axes_at_one_time(bench):
     bench.start()
     bench.move(3000, -900, speed=1000)
@@ -518,6 +527,14 @@ ENDS = {
     "unplugged, says pyserial": (unplugged(serial.SerialException("device reports readiness")), LostError, "PORT"),
     "switched off and on": (power_cycled, PositionLostError, "cotarget reset-head"),
     "starts up": (lambda bench: bench.port.inject(BANNER), PositionLostError, "switched off and on"),
+    **{
+        f"starts up after {late} s": (
+            lambda bench, late=late: (silent(bench), bench.port.inject(BANNER, late)),
+            PositionLostError,
+            "switched off and on",
+        )
+        for late in (0.1, 0.2, 0.3, 0.5)  # at other places of the attempts to synchronize
+    },
     "!P in two halves": (
         lambda bench: halved(bench, b"!P"),
         PositionLostError,

@@ -93,17 +93,17 @@ def test_limits_are_the_units_in_the_sense_of_the_file(opened):
 )
 def test_signs_turn_axes_round(opened, bench, config, goals):
     head = opened(config)
-    assert head.move(10 * STEP, 20.4 * STEP, wait=True) == (pytest.approx(10 * STEP), pytest.approx(20 * STEP))
+    assert head.move(10 * STEP, 19.6 * STEP, wait=True) == (pytest.approx(10 * STEP), pytest.approx(20 * STEP))
     assert bench.unit.goals() == goals
     assert head.state().tilt == pytest.approx(20 * STEP)
 
 
 @pytest.mark.parametrize(
     ("asked", "set_to"),
-    [(None, 2897), (0.1, 111), (111.6 * STEP, 111), (112 * STEP, 112), (1e-9, 31), (1e9, 2897)],
+    [(None, 2897), (0.1, 111), (111.6 * STEP, 111), (58 * STEP, 58), (1e-9, 31), (1e9, 2897)],
 )
 def test_speeds_are_within_the_units_and_the_files_bounds(opened, bench, asked, set_to):
-    # 149 degrees a second are 2897 steps; 0.1 rad/s is 111.
+    # 149 degrees a second are 2897 steps; 0.1 rad/s is 111; 58 steps are 57.99... after the conversion.
     opened().move(STEP, STEP, speed=asked, wait=True)
     assert bench.unit.speed == {"P": set_to, "T": set_to}
 
