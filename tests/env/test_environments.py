@@ -9,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 from cotarget.config import RigConfig
+from cotarget.detection import Detection
 from cotarget.env import FOLLOW, SCHEDULE, Follow, PipelinePolicy, Schedule, SchedulingPolicy
 from cotarget.env.common import RIG_FEATURES, Units
 from cotarget.env.follow import TRACK_FEATURES
@@ -179,6 +180,21 @@ def test_track_features_follow_the_true_box(field):
     assert abs(moved[0]) > 20.0  # px/s: it walks
     assert track["du"] == pytest.approx(2 * moved[0] / width, rel=0.3)
     assert track["dv"] == pytest.approx(2 * moved[1] / height, abs=0.05)
+    env.close()
+
+
+def test_rates_are_in_half_images_a_second(field):
+    """A box moves by 64 px/s to the right and by 48 px/s down in 640x480: 0.2 each."""
+    env = Follow("person", rig=field, seconds=3.0)
+    env.reset(seed=0)
+    size_px = np.array([40.0, 100.0])
+    env.episode.detector.detect = lambda frame: [
+        Detection(np.array([100.0, 80.0]) + frame.t * np.array([64.0, 48.0]), size_px, 1.0, False)
+    ]
+    for _ in range(60):
+        observation, *_ = env.step(STILL)
+    track = named(observation)
+    assert (track["du"], track["dv"]) == pytest.approx((0.2, 0.2), rel=0.05)
     env.close()
 
 

@@ -67,6 +67,18 @@ def test_the_reward_is_a_good_closeup_by_the_metrics(field, zoom, aside_px, rewa
     env.close()
 
 
+def test_a_zoom_frame_is_rewarded_once(field):
+    """The zoom camera has half the rate of the fixed one, which gives the steps."""
+    rig = textbook(field)
+    zoom = dataclasses.replace(rig.sim.zoom, rate_hz=rig.sim.fixed.rate_hz / 2)
+    env = Follow("book", rig=dataclasses.replace(rig, sim=dataclasses.replace(rig.sim, zoom=zoom)), seconds=1.0)
+    env.reset(seed=3)
+    told = [env.step(looking_at(env, 1.0, 0.0)) for _ in range(12)][4:]
+    assert all(info["good"] for *_, info in told)
+    assert sum(reward for _, reward, *_ in told) == len(told) / 2
+    env.close()
+
+
 def test_rewards_are_those_of_the_exact_truth(field):
     """Outlines are told by tables; a close-up that is good by the truth is one by them, but at the very bounds."""
     env = Follow("bird", rig=field, seconds=4.0)
