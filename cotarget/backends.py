@@ -34,7 +34,7 @@ def load_config(path: Path | str, text: str | None = None) -> "RigConfig":
 
 
 def check(config: "RigConfig") -> None:
-    """Check what only the backends know: the simulated world, and [hardware] by its drivers; nothing is opened.
+    """Check the simulated world, and [hardware] by its drivers, without opening anything.
 
     Raises:
         ConfigError: a value is refused; the message names the key.
@@ -51,12 +51,12 @@ def check(config: "RigConfig") -> None:
 
 
 def _check_times(config: "RigConfig") -> None:
-    """Refuse times of the safety layer that would end every run."""
+    """Refuse timeouts of the safety layer that would end every run."""
     spec, safety = _described(config), config.safety
     if safety.watchdog_s * spec.fixed.rate_hz <= 1:
         raise ConfigError(
             f"safety.watchdog_s: {safety.watchdog_s:g} s would halt the head between any two frames of the fixed "
-            f"camera, of which {spec.fixed.rate_hz:g} come a second"
+            f"camera, which has {spec.fixed.rate_hz:g} a second"
         )
     for name, camera in (("fixed", spec.fixed), ("zoom", spec.zoom)):
         if camera.latency_s >= safety.max_frame_age_s:
@@ -75,7 +75,7 @@ def open_rig(config: "RigConfig | Path | str", guarded: bool = True) -> Rig:
             `cotarget.safety.safe_rig.guard` itself.
 
     Raises:
-        ConfigError: the configuration is malformed, or does not say enough of that rig.
+        ConfigError: the configuration is malformed, or lacks a key that the rig needs.
         DeviceError: a device could not be opened.
         EmergencyStopError: the stop file exists.
     """
@@ -105,7 +105,7 @@ def _open_replay(config: "RigConfig") -> Rig:
     return Replay(open_recording(_recording_of(config))).rig
 
 
-# By the backend's name, functions that open its rig without the safety layer.
+# Functions that open a backend's rig without the safety layer.
 OPENERS: dict[str, Callable[["RigConfig"], Rig]] = {
     "sim": _open_simulation,
     "hardware": _open_hardware,
@@ -114,10 +114,10 @@ OPENERS: dict[str, Callable[["RigConfig"], Rig]] = {
 
 
 def open_recording(directory: Path) -> "Recording":
-    """Read a recording up to where it is whole; images must exist, but are not read.
+    """Read the complete part of a recording; images must exist, but are not read.
 
     Raises:
-        ConfigError: the folder is no recording, has another schema, or holds nothing that can be replayed.
+        ConfigError: the folder is no recording, has another schema, or has nothing that can be replayed.
     """
     from cotarget.recording.format import read_recording
 

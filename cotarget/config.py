@@ -8,7 +8,6 @@ The types of the fields say what a value may be, see `cotarget.schema`. `check_c
 values that make no sense.
 """
 
-import dataclasses
 import re
 import tomllib
 import types
@@ -29,7 +28,9 @@ from cotarget.schema import (
     ASCENDING,
     Check,
     FilePath,
+    InFolder,
     Limits,
+    NotEmptyPath,
     NotNegative,
     Pair,
     Pose,
@@ -62,7 +63,7 @@ def check_square(square: float, where: str) -> None:
         ConfigError: the side is refused; the message names the option or key ``where``.
     """
     if square > LARGEST_SQUARE_M:
-        raise ConfigError(f"{where}: {square:g} m is no board's square; 25 mm are 0.025")
+        raise ConfigError(f"{where}: {square:g} m is too large for a board's square; 25 mm are 0.025")
 
 
 def check_corners(board: "BoardConfig") -> None:
@@ -256,6 +257,11 @@ DEFAULT_GAMMA = pose([-0.40, 0.03, 0.06], [0.8, -1.9, 0.6])
 DEFAULT_T = pose([0.02, -0.08, 0.05], [0.7, -1.4, 0.5])
 
 
+def _scene(name: str, folder: Path) -> str:
+    """Complete the path of a scene's file; the name of a built-in scene stays."""
+    return str(folder / name) if (folder / name).is_file() else name
+
+
 @model
 class SimConfig:
     """The simulated world.
@@ -277,7 +283,7 @@ class SimConfig:
             the world, joined by a smooth curve.
     """
 
-    scene: str = "outdoor"
+    scene: Annotated[str, InFolder(_scene)] = "outdoor"
     seed: Annotated[int, Ge(0)] = 0
     targets: tuple[str, ...] = ()
     T_zoom0_fixed: Pose = DEFAULT_GAMMA
@@ -313,10 +319,10 @@ def _fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
     """Scale the cameras' defaults to the image size or focal length of a [sim] table; keys given there stay."""
     cameras: dict[str, SimCamera] = {}
     for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
-        said = given.get(name, {})
+        keys = given.get(name, {})
         # Nothing changes if size and focal length are the defaults.
-        follows = type(camera)().fitted(camera.size, camera.focal_px if "focal_px" in said else None)
-        cameras[name] = replace(camera, **{key: value for key, value in follows.items() if key not in said})
+        scaled = type(camera)().fitted(camera.size, camera.focal_px if "focal_px" in keys else None)
+        cameras[name] = replace(camera, **{key: value for key, value in scaled.items() if key not in keys})
     return replace(sim, **cameras)  # type: ignore[arg-type]
 
 
@@ -336,7 +342,14 @@ def known_targets(own: Iterable[str] = ()) -> str:
 
 # The [hardware] tables
 
-Table = Mapping[str, Any]
+
+def _located(device: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
+    """Replace the module of a user's own driver by its file, where that is in the folder."""
+    driver = device.get("driver")
+    return {**device, "driver": locate(driver, folder)} if isinstance(driver, str) else device
+
+
+Table = Annotated[Mapping[str, Any], InFolder(_located)]
 
 
 @model
@@ -401,7 +414,9 @@ def _detector(name: str) -> str:
     return name
 
 
-DetectorName = Annotated[str, '"colour", "motion", "speck", "mog2" or "module:function"', Check(_detector)]
+DetectorName = Annotated[
+    str, '"colour", "motion", "speck", "mog2" or "module:function"', Check(_detector), InFolder(locate)
+]
 
 
 @model
@@ -494,7 +509,7 @@ class SafetyConfig:
     speed_deg_s: Positive | None = None
     max_frame_age_s: Annotated[Positive, Le(LONGEST_UNSEEN_S)] = 1.0
     watchdog_s: Annotated[Positive, Le(LONGEST_UNSEEN_S)] = 0.35
-    stop_file: Annotated[FilePath, Check(_file_name)] | None = None
+    stop_file: Annotated[NotEmptyPath, Check(_file_name)] | None = None
 
 
 @model
@@ -543,38 +558,11 @@ def config_of(text: str, path: Path) -> RigConfig:
     """
     table = _tables(text, path)
     try:
-        config = parse_config(table)
+        config = parse_config(table, path.parent)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    beside = {  # an absolute template path stays unchanged
-        name: dataclasses.replace(
-            target,
-            template=target.template and path.parent / target.template,
-            detector=locate(target.detector, path.parent),
-        )
-        for name, target in config.targets.items()
-    }
-    scene = path.parent / config.sim.scene
-    sim = dataclasses.replace(config.sim, scene=str(scene)) if scene.is_file() else config.sim
-    sim = dataclasses.replace(sim, models={name: path.parent / model for name, model in sim.models.items()})
-    recording = config.recording and path.parent / config.recording
-    said = table.get("safety", {}).get("stop_file")
-    safety = dataclasses.replace(config.safety, stop_file=locate_stop_file(path, config.backend, said))
-    hardware = {name: _located(table, path.parent) for name, table in vars(config.hardware).items()}
-    return dataclasses.replace(
-        config,
-        targets=beside,
-        sim=sim,
-        recording=recording,
-        safety=safety,
-        hardware=HardwareConfig(**hardware),
-    )
-
-
-def _located(device: Table, folder: Path) -> Table:
-    """Replace the module of a user's own driver by its file, where that lies beside rig.toml."""
-    driver = device.get("driver")
-    return {**device, "driver": locate(driver, folder)} if isinstance(driver, str) else device
+    stop_file = locate_stop_file(path, config.backend, table.get("safety", {}).get("stop_file"))
+    return replace(config, safety=replace(config.safety, stop_file=stop_file))
 
 
 def read_tables(path: Path) -> dict[str, Any]:
@@ -611,13 +599,14 @@ def _tables(text: str, path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: is not TOML: {error}") from None
 
 
-def parse_config(table: Mapping[str, Any]) -> RigConfig:
+def parse_config(table: Mapping[str, Any], folder: Path | None = None) -> RigConfig:
     """Build the configuration from TOML's tables; missing keys keep their defaults.
 
-    What only a backend can check, such as a simulated world, is checked by `cotarget.backends.check`.
+    `cotarget.backends.check` checks what only a backend knows, such as the simulated world.
 
     Args:
         table: tables as TOML gives them.
+        folder: folder of the file, to which its paths and modules are relative; without it they stay as they are.
 
     Raises:
         ConfigError: an unknown key or an impossible value.
@@ -628,15 +617,16 @@ def parse_config(table: Mapping[str, Any]) -> RigConfig:
     if not isinstance(given, Mapping):
         raise ConfigError(f"targets: {given!r} is not a table")
     for name, values in given.items():
-        targets[name] = validate(TargetProfile, values, f"targets.{name}", base=_of_kind(targets, name))
+        base = _of_kind(targets, name)
+        targets[name] = validate(TargetProfile, values, f"targets.{name}", base=base, folder=folder)
     sim_table = table.get("sim")
     if isinstance(sim_table, Mapping) and isinstance(sim_table.get("effects"), Mapping):
         table["sim"] = {**sim_table, "effects": _expand_all(sim_table["effects"])}
     safety = table.get("safety")
     if isinstance(safety, Mapping) and safety.get("stop_file") is False:
         table["safety"] = {key: value for key, value in safety.items() if key != "stop_file"}
-    config = validate(RigConfig, table, "")
-    config = dataclasses.replace(config, targets=targets, sim=_fit_sizes(config.sim, table.get("sim", {})))
+    config = validate(RigConfig, table, "", folder=folder)
+    config = replace(config, targets=targets, sim=_fit_sizes(config.sim, table.get("sim", {})))
     check_corners(config.board)
     return config
 
@@ -651,7 +641,7 @@ def config_table(config: RigConfig) -> dict[str, Any]:
 
     Passwords are left out, and so is what would keep a replay from running, such as the stop file.
     """
-    table: dict[str, Any] = as_table(dataclasses.replace(config, recording=None))
+    table: dict[str, Any] = as_table(replace(config, recording=None))
     table["safety"].pop("stop_file", None)
     devices = {name: _without_secrets(device) for name, device in table.pop("hardware").items() if device}
     return table | ({"hardware": devices} if devices else {})

@@ -3,6 +3,7 @@
 import importlib.metadata
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,20 +17,6 @@ from cotarget.files import assets_dir
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
 
-PACKAGES = (
-    "cotarget",
-    "mujoco",
-    "numpy",
-    "opencv-python-headless",
-    "scipy",
-    "gymnasium",
-    "pyserial",
-    "av",
-    "matplotlib",
-    "pydantic",
-    "jinja2",
-    "rich",
-)
 OLDEST_PYTHON = (3, 11)
 # Rendering is tried in its own process, because a broken OpenGL may crash it.
 RENDER = (
@@ -51,15 +38,10 @@ class Finding:
 
 
 def examine(config: "RigConfig | None" = None, rig: Path = Path("rig.toml")) -> list[Finding]:
-    """Examine everything that cotarget needs; with a rig's configuration also its devices, without moving anything.
-
-    Args:
-        config: the configuration.
-        rig: its file.
-    """
+    """Examine everything that cotarget needs; with a rig's configuration and file also its devices."""
     found = [
         _python(),
-        *map(_package, PACKAGES),
+        *map(_package, needed_packages()),
         _assets(),
         rendering(),
         _codec(),
@@ -81,6 +63,12 @@ def _python() -> Finding:
     ok = sys.version_info >= OLDEST_PYTHON
     fix = "" if ok else f"install Python {'.'.join(map(str, OLDEST_PYTHON))} or newer"
     return Finding("python", ok, f"{platform.python_version()} on {platform.platform()}", fix)
+
+
+def needed_packages() -> list[str]:
+    """List cotarget and the packages that every installation of it needs."""
+    needs = importlib.metadata.requires("cotarget") or []
+    return ["cotarget", *(re.split("[<>=!~;[ ]", each)[0] for each in needs if "extra ==" not in each)]
 
 
 def _package(name: str) -> Finding:
@@ -149,18 +137,18 @@ def _emergency_stop(config: "RigConfig", rig: Path) -> Finding:
 
     name, path = "emergency stop", config.safety.stop_file
     if path is None:
-        return Finding(name, True, "there is no stop file: no other shell can stop the head")
+        return Finding(name, True, "no stop file is configured: no other shell can stop the head")
     try:
         refuse_if_stopped(path)
     except EmergencyStopError as error:
         return Finding(name, False, str(error), f"cotarget clear --rig {rig}")
     except ConfigError as error:
         return Finding(name, False, str(error), f"{'chmod u+w' if path.parent.is_dir() else 'mkdir -p'} {path.parent}")
-    return Finding(name, True, "there is none")
+    return Finding(name, True, "none")
 
 
 def _own_detectors(config: "RigConfig", rig: Path) -> list[Finding]:
-    """Import the detectors of the user's own that targets name."""
+    """Import the user's detectors that targets name."""
     from cotarget.plugins import is_own, load
 
     found = []
@@ -176,14 +164,14 @@ def _own_detectors(config: "RigConfig", rig: Path) -> list[Finding]:
 
 
 def _board(config: "RigConfig", rig: Path) -> list[Finding]:
-    """Check whether rig.toml says how large the board's squares are; without that no real rig is calibrated."""
+    """Check whether rig.toml has the size of the board's squares, without which no real rig is calibrated."""
     from cotarget.config import check_square, read_tables
 
-    if not rig.exists():  # a configuration that was made in Python says all that it has to
+    if not rig.exists():  # a configuration that was made in Python is complete
         return []
     if "square" not in read_tables(rig).get("board", {}):
         fix = f"measure ten squares, and write one into [board] in {rig}: square = 0.025"
-        return [Finding("board", False, "how large its squares are is not configured", fix)]
+        return [Finding("board", False, "the size of its squares is not configured", fix)]
     board, (columns, rows) = config.board, config.board.corners
     try:
         check_square(board.square, "square")
@@ -201,7 +189,7 @@ def _position(config: "RigConfig", port: str, rig: Path) -> Finding:
         PositionLostMarker(port, config.safety.stop_file).refuse()
     except CotargetError as error:
         return Finding("head's position", False, str(error), f"cotarget reset-head --rig {rig}")
-    return Finding("head's position", True, "nothing says that it is lost")
+    return Finding("head's position", True, "not marked as lost")
 
 
 def _devices(config: "RigConfig", rig: Path) -> list[Finding]:

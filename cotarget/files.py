@@ -26,9 +26,8 @@ def assets_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "sim_assets"
 
 
-# Longest wait for another run that is writing a small file [s]; writing takes less.
-PATIENCE_S = 5.0
-LOOK_S = 0.01  # interval of the attempts meanwhile [s]
+PATIENCE_S = 5.0  # longest wait for another run that is writing a small file [s]
+RETRY_S = 0.01  # interval of the attempts to lock it [s]
 
 
 def behind_link(path: Path) -> Path:
@@ -39,7 +38,7 @@ def behind_link(path: Path) -> Path:
 class PartFile:
     """Temporary file beside a result, which gets the result's name in one step.
 
-    It has the same name in every run and is locked while its run lives: a second run on the same result waits or is
+    It has the same name in every run and is locked until its run ends: a second run on the same result waits or is
     refused, and the file of a killed run is reused.
 
     Attributes:
@@ -47,7 +46,7 @@ class PartFile:
     """
 
     def __init__(self, path: Path, patience_s: float = 0.0) -> None:
-        """Lock the file; it may hold what a killed run has left.
+        """Lock the file, which may be that of a killed run.
 
         Args:
             path: the result; if it is a link, the link's target is replaced in the end.
@@ -78,7 +77,7 @@ class PartFile:
                 os.close(lock)
                 if time.monotonic() >= until:
                     raise
-                time.sleep(LOOK_S)
+                time.sleep(RETRY_S)
                 continue
             except BaseException:
                 os.close(lock)
@@ -127,7 +126,7 @@ class PartFile:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a result that cannot be written, before the work and not after it.
+    """Refuse a result that cannot be written, before the work starts.
 
     Raises:
         ConfigError: another run is writing it, or its folder is not writable.
@@ -170,7 +169,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
 
 
-STDOUT = Path("-")  # name by which a table goes to stdout
+STDOUT = Path("-")  # name of stdout as the file of a table
 
 
 class CsvFile:

@@ -1,4 +1,4 @@
-"""Run long jobs in processes of their own, which end with their parent."""
+"""Run long jobs in separate processes, which end with their parent."""
 
 import contextlib
 import ctypes
@@ -13,22 +13,22 @@ from typing import Any, TypeVar
 from cotarget.errors import CotargetError
 
 Result = TypeVar("Result")
-# Called with what is done, how much there is (None where no end is known), and a text.
+# Called with the amount done, the total (None if it is unknown), and a text.
 Progress = Callable[[float, float | None, str], object]
 ORPHANED = 1  # exit status of a process whose parent has ended
-# Parameters of glibc's mallopt: one arena for all threads; blocks from MAPPED on [bytes] are mapped by themselves, so
-# that their memory is free as soon as they are. A run of the demo then takes 470 to 520 MB in place of 570.
+# Parameters of glibc's mallopt: one arena for all threads, and a separate mapping for each block of at least MAPPED
+# bytes, whose memory is free when the block is. The demo then needs 470 to 520 MB in place of 570.
 M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
 MAPPED = 262144
 
 
 def run_apart(job: Callable[..., Result], arguments: tuple[Any, ...], report: Callable[..., object]) -> Result:
-    """Run ``job(*arguments, report)`` in a process of its own, whose memory is free again afterwards.
+    """Run ``job(*arguments, report)`` in a separate process, whose memory is free afterwards.
 
     Args:
         job: a function at the top level of a module.
         arguments: its arguments; they and the result are pickled.
-        report: called here with whatever the job reports.
+        report: called in this process with the arguments with which the job calls its ``report``.
 
     Raises:
         CotargetError: the job raised it, or its process died. Other errors of the job are raised as they are.
@@ -60,7 +60,7 @@ def run_apart(job: Callable[..., Result], arguments: tuple[Any, ...], report: Ca
 
 
 def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> None:
-    """Run the job in this process; send its progress and its result."""
+    """Run the job in this process; send its progress, and its result or error."""
     end_with_parent()
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(M_ARENA_MAX, 1)
@@ -78,7 +78,7 @@ def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> 
 
 @contextlib.contextmanager
 def interrupts_kept_from_children() -> Iterator[None]:
-    """Let processes started in this block ignore Ctrl-C, which reaches all of them; their parent ends them."""
+    """Let processes started in this block ignore Ctrl-C, which reaches the whole group; their parent ends them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -90,7 +90,7 @@ def interrupts_kept_from_children() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """End this process as soon as its parent has ended in any way; call it first."""
+    """End this process as soon as its parent has ended."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_after, args=(parent.sentinel,), name="end with parent", daemon=True).start()

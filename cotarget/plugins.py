@@ -1,8 +1,8 @@
-"""Drivers and detectors of a user's own, named "module:name" in rig.toml.
+"""Load a user's drivers and detectors, named "module:name" in rig.toml.
 
-The module is found beside rig.toml, or else where Python finds modules. `locate` writes a module beside rig.toml as its
-file, so that the name means the same in every process and folder; `load` imports it. An error inside the user's code
-becomes one line that names file and line.
+The module is beside rig.toml or on Python's path. `locate` replaces a module beside rig.toml by its file, so that the
+name is valid in every process and folder; `load` imports it. An error inside the user's code becomes one line that
+names file and line.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from cotarget.errors import ConfigError, CotargetError, DeviceError, choices
 
 FORM = "module:name"
-LONGEST = 60  # characters of a wrong answer that a message repeats
+LONGEST = 60  # a longer wrong answer is described by its type in messages [characters]
 
 
 def is_own(name: str) -> bool:
@@ -69,12 +69,12 @@ def load(name: str, where: str) -> Any:
 
 @functools.cache
 def _from_file(path: str) -> ModuleType:
-    """Import a file as a module of its own; modules beside it can be imported from it."""
+    """Import a file as a separate module, which can import modules beside it."""
     file = Path(path)
     if str(file.parent) not in sys.path:
         sys.path.append(str(file.parent))
-    # A name of its own, because dataclasses look their module up by it: the file may be a second webcam.py, or be
-    # called as the library that it imports. Dots would make it a module of a package.
+    # The name is unique, because dataclasses look up their module by name: the file may be a second webcam.py, or have
+    # the name of a library that it imports. Dots would make it a module of a package.
     spec = importlib.util.spec_from_file_location(path.replace(".", "_"), file)
     if spec is None or spec.loader is None or not file.is_file():
         raise ModuleNotFoundError(f"there is no {file}")
@@ -90,18 +90,14 @@ def _from_file(path: str) -> ModuleType:
 
 @contextlib.contextmanager
 def calling(what: str) -> Iterator[None]:
-    """Turn an error of a user's code into one line that names file and line.
-
-    Raises:
-        DeviceError: the code raised anything but a CotargetError.
-    """
+    """Turn an error of a user's code into a DeviceError of one line that names file and line."""
     try:
         yield
     except CotargetError:
         raise
     except Exception as error:
-        said = " ".join(str(error).split())
-        raise DeviceError(f"{what}: {place_of(error)}: {type(error).__name__}{said and f': {said}'}") from error
+        text = " ".join(str(error).split())
+        raise DeviceError(f"{what}: {place_of(error)}: {type(error).__name__}{text and f': {text}'}") from error
 
 
 def place_of(error: Exception) -> str:
@@ -117,7 +113,7 @@ def _is_ours(file: str) -> bool:
 
 
 class Answer(NamedTuple):
-    """What a user's device has to answer by a method or attribute: the check, and its description in messages."""
+    """What a method or attribute of a user's device must return: the check, and its description in messages."""
 
     is_right: Callable[[Any], bool]
     description: str
@@ -131,19 +127,15 @@ def reporting(function: Callable[..., Any], what: str, answer: Answer | None = N
         with calling(what):
             found = function(*arguments, **keywords)
         if answer is not None and not answer.is_right(found):
-            said = f"{function.__name__} returned {_short(found)}"
-            raise DeviceError(f"{what}: {said}; it has to return {answer.description}")
+            wrong = f"{function.__name__} returned {_short(found)}"
+            raise DeviceError(f"{what}: {wrong}; it has to return {answer.description}")
         return found
 
     return call
 
 
 def check_attribute(device: Any, name: str, what: str, answer: Answer) -> None:
-    """Refuse a device's attribute that is not what it has to be.
-
-    Raises:
-        DeviceError: it is not.
-    """
+    """Refuse a wrong attribute of a user's device."""
     with calling(what):
         found = getattr(device, name)
     if not answer.is_right(found):
@@ -151,17 +143,17 @@ def check_attribute(device: Any, name: str, what: str, answer: Answer) -> None:
 
 
 def _short(wrong: Any) -> str:
-    said = " ".join(repr(wrong).split())
-    return said if len(said) <= LONGEST else f"a {type(wrong).__name__}"
+    text = " ".join(repr(wrong).split())
+    return text if len(text) <= LONGEST else f"a {type(wrong).__name__}"
 
 
 class Reporting:
-    """A user's device whose errors name file and line, and whose answers are checked; everything else passes through.
+    """A user's device whose errors name file and line, and whose answers are checked.
 
     Args:
         device: the device.
         what: its table in rig.toml, for messages.
-        answers: what its methods have to return, by name; None for nothing.
+        answers: what its methods must return, by name.
     """
 
     def __init__(self, device: Any, what: str, answers: Mapping[str, Answer | None]) -> None:

@@ -24,8 +24,7 @@ Image = npt.NDArray[np.uint8]
 Angles = tuple[float, float]  # pan and tilt [rad]
 Speed = float | tuple[float, float]  # one speed for both axes of a head, or one each for pan and tilt [rad/s]
 
-# Longest wait of a camera for its next frame [s]; later none will come.
-READ_TIMEOUT_S = 1.0
+READ_TIMEOUT_S = 1.0  # longest wait for a camera's next frame [s]
 # A frame cannot be from the future; this tolerance allows for a configured latency that is too long [s].
 FUTURE_S = 0.05
 
@@ -101,7 +100,7 @@ class PanTiltLimits:
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """What a camera knows of itself.
+    """Properties of a camera, known without opening it.
 
     Attributes:
         size: (width, height) of its stream [px].
@@ -116,7 +115,7 @@ class CameraSpec:
 
 @dataclass(frozen=True)
 class ZoomSpec(CameraSpec):
-    """What a zoom camera knows of itself.
+    """Properties of a zoom camera, known without opening it.
 
     Attributes:
         focal_range: shortest and longest nominal focal length [px].
@@ -133,7 +132,7 @@ class ZoomSpec(CameraSpec):
 
 @dataclass(frozen=True)
 class HeadSpec:
-    """What a head knows of itself: its limits, and the time from a command to the start of its motion [s]."""
+    """Properties of a head: its limits, and the time from a command to the start of its motion [s]."""
 
     limits: PanTiltLimits
     delay_s: float
@@ -141,7 +140,7 @@ class HeadSpec:
 
 @dataclass(frozen=True)
 class RigSpec:
-    """What a rig knows of itself.
+    """Properties of a rig, known without opening it.
 
     Attributes:
         fixed: the fixed camera.
@@ -236,11 +235,11 @@ class Clock(Protocol):
 
 
 class Board(Protocol):
-    """A person or device that holds a calibration board on request."""
+    """A person or device that holds a calibration board at requested poses."""
 
     @property
     def patience(self) -> float:
-        """Longest time until the board is held still at the requested pose [s]; 0 if it is there at once."""
+        """Longest time until the board is still at the requested pose [s]; 0 if it is there at once."""
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
         """Request the board at a pose (of its first corner's frame), or no board; the result is not reported."""
@@ -278,10 +277,10 @@ class Rig:
         head: the pan-tilt head.
         clock: the rig's clock.
         board: the calibration board's holder.
-        spec: what the devices know of themselves.
+        spec: properties of the devices.
         release: halts the head and releases the devices; may be called again.
         config: the configuration that the rig was opened from; None if it was made in another way.
-        guard: the safety layer, see `cotarget.safety.safe_rig.guard`; None for a rig without.
+        guard: the safety layer, see `cotarget.safety.safe_rig.guard`; None for a rig without one.
     """
 
     fixed: Camera
@@ -322,7 +321,7 @@ class Rig:
         """Halt the head, then release the devices; may be called again.
 
         Raises:
-            Exception: as the device raised it when it could not be halted, or closed.
+            Exception: as the device raised it when it could not be halted or closed.
         """
         self.release()
 

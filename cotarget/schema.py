@@ -58,6 +58,26 @@ class Check:
         return (before if self.before else after)(self.function, handler(source))
 
 
+@dataclass(frozen=True)
+class InFolder:
+    """Complete a value that is relative to the folder of its file.
+
+    Attributes:
+        function: takes the value and the folder, and returns the complete value.
+    """
+
+    function: Callable[[Any, Path], Any]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
+        """Describe the completion to pydantic, whose context is the folder."""
+        from pydantic_core import core_schema
+
+        def complete(value: Any, info: Any) -> Any:
+            return value if info.context is None else self.function(value, info.context)
+
+        return core_schema.with_info_after_validator_function(complete, handler(source))
+
+
 class OneOf(Check):
     """Take one of some numbers; a Literal would take True for 1."""
 
@@ -122,7 +142,8 @@ NotNegative = Annotated[float, Ge(0)]
 ASCENDING = Check(_refuse_disorder)
 Limits = Annotated[Pair, "[lowest, highest]", ASCENDING]
 Size = Annotated[tuple[Annotated[int, Gt(0)], Annotated[int, Gt(0)]], "[width, height]"]
-FilePath = Annotated[Path, Check(_refuse_empty, before=True)]
+NotEmptyPath = Annotated[Path, Check(_refuse_empty, before=True)]
+FilePath = Annotated[NotEmptyPath, InFolder(lambda path, folder: folder / path)]
 Pose = Annotated[RigidTransform, _AsPose()]
 
 
@@ -137,7 +158,14 @@ class _PoseTable:
 # Validation
 
 
-def validate(cls: type[T], table: Any, where: str, base: T | None = None, beside: Iterable[str] = ()) -> T:
+def validate(
+    cls: type[T],
+    table: Any,
+    where: str,
+    base: T | None = None,
+    beside: Iterable[str] = (),
+    folder: Path | None = None,
+) -> T:
     """Make a dataclass from a table.
 
     Args:
@@ -146,6 +174,7 @@ def validate(cls: type[T], table: Any, where: str, base: T | None = None, beside
         where: dotted name of the table, for messages.
         base: an instance whose values are the defaults instead.
         beside: further keys that the table may have, for messages.
+        folder: folder of the file, to which its paths and modules are relative; without it they stay as they are.
 
     Raises:
         ConfigError: an unknown key with the valid ones, a missing key, or a refused value.
@@ -159,7 +188,7 @@ def validate(cls: type[T], table: Any, where: str, base: T | None = None, beside
         whole = {name: as_table(getattr(base, name)) for name in _required(cls)} | dict(table)
     try:
         adapter = _adapter(cast(Any, cls))
-        found: T = adapter.validate_json(json.dumps(whole, default=_no_json))
+        found: T = adapter.validate_json(json.dumps(whole, default=_no_json), context=folder)
     except ValidationError as error:
         raise ConfigError(_message(cls, error.errors(include_url=False), where, beside)) from None
     if base is None:
@@ -195,7 +224,7 @@ def _adapter(cls: Any) -> Any:
 
 
 def _make_strict(cls: type[Any]) -> None:
-    """Make a plain dataclass strict, with those in it."""
+    """Make a plain dataclass strict, and the dataclasses of its fields."""
     if not hasattr(cls, CONFIG):
         setattr(cls, CONFIG, STRICT)
         for hint in typing.get_type_hints(cls).values():
@@ -220,9 +249,9 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
     """Say in one line what is wrong; an unknown key comes first, because a misspelt one makes others missing."""
     error = min(errors, key=lambda each: each["type"] != UNKNOWN)
     kind, loc, value = error["type"], error["loc"], error["input"]
-    if kind == "json_invalid":  # a text with half of a surrogate pair, or tables in tables without end
+    if kind == "json_invalid":  # half of a surrogate pair in a text, or tables nested too deeply
         return f"{where or 'the file'}: {error['msg']}"
-    for end in range(len(loc)):  # below a union, pydantic's place goes on with the type that it tried
+    for end in range(len(loc)):  # below a union, pydantic's location continues with the type that it tried
         if _is_union(_hint_at(cls, loc[:end])):
             tried = (each for each in errors if each["loc"][:end] == loc[:end])
             return f"{_join(where, loc[:end])}: {'; '.join(dict.fromkeys(map(_words, tried)))}"
@@ -243,9 +272,9 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
     if kind == "literal_error":
         return f"{at}: {value!r} is not one of: {choices(map(str, typing.get_args(bare(hint))))}"
     if kind == "value_error":
-        said = str(error["ctx"]["error"])
+        reason = str(error["ctx"]["error"])
         is_table = dataclasses.is_dataclass(bare(hint)) or bare(hint) is RigidTransform
-        return _join(at, (said,)) if is_table else f"{at}: {said}"
+        return _join(at, (reason,)) if is_table else f"{at}: {reason}"
     while kind in RANGES and at.endswith("]"):  # the range is the list's
         at = at[: at.rindex("[")]
     return f"{at}: {_words(error)}{_form(hint) if kind == 'tuple_type' else ''}"

@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from cotarget.cli.common import not_negative, positive_int, progress_bar
+from cotarget.cli.common import progress_bar, whole
 from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError, choices
 from cotarget.plugins import is_own
@@ -88,10 +88,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--list", action="store_true", help="print the names and purposes")
     add("--quick", action="store_true", help="less of each, against its bounds")
     add("--out", type=Path, metavar="DIR", help=f"results and report ({OUT}, or {OUT_QUICK} if quick)")
-    add("--seeds", type=positive_int, metavar="N", help="of each; its own number by default")
-    add("--seed-base", type=not_negative, metavar="B", help="the first seed (0)")
+    add("--seeds", type=whole(1), metavar="N", help="of each; its own number by default")
+    add("--seed-base", type=whole(0), metavar="B", help="the first seed (0)")
     add("--set", action="append", default=[], metavar="NAME.KEY=VALUE", help="change a setting; each value is a case")
-    add("--processes", type=positive_int, default=processes, metavar="P", help=f"seeds at a time ({processes})")
+    add("--processes", type=whole(1), default=processes, metavar="P", help=f"seeds at a time ({processes})")
     add("--scheduler", metavar="ADDRESS", help="of the Dask cluster, such as tcp://10.0.0.1:8786; one of this machine")
     # Both are Dask now; scripts give it.
     add("--backend", choices=("processes", "dask"), default="processes", help=argparse.SUPPRESS)

@@ -12,7 +12,7 @@ import serial
 from cotarget import cli, doctor
 from cotarget.backends import load_config
 from cotarget.config import parse_config
-from cotarget.doctor import PACKAGES, Finding
+from cotarget.doctor import Finding, needed_packages
 from cotarget.drivers.ptu_d46 import UncalibratedError
 from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.plant import Feed
@@ -44,7 +44,7 @@ def test_a_machine_that_has_everything(tried, capsys):
     findings = doctor.examine()
     assert all(f.ok and not f.fix for f in findings if f.name != "cotarget"), findings
     names = [f.name for f in findings]
-    assert {"python", "rendering", "H.264", "sim_assets", "serial ports", "gphoto2 cameras", *PACKAGES} == set(names)
+    assert {"python", "rendering", "H.264", "sim_assets", "serial ports", "gphoto2 cameras", *needed_packages()} == set(names)
     assert finding("rendering").text == "without a screen by egl"
     assert finding("sim_assets").text == "scenes indoor, outdoor"
     assert cli.main(["doctor"]) == 0

@@ -45,7 +45,7 @@ def calibrate_command(options: argparse.Namespace) -> None:
     check_outputs([options.out], [*inputs, *_lists(options.captures)])
     if config is not None and config.backend == "replay":
         raise ConfigError(
-            f"{options.rig}: backend is 'replay'; what a session has captured is calibrated by --from DIR"
+            f"{options.rig}: backend is 'replay'; calibrate from the captures of a session: --from DIR"
         )
     _check_together(options)
     check_writable(options.out)
@@ -94,7 +94,7 @@ def _print_result(found: "Calibration", path: Path) -> None:
 
 
 def _lists(directory: Path | None) -> list[Path]:
-    """Give the files that describe a folder of captures."""
+    """List the files that describe a folder of captures."""
     return [] if directory is None else [directory / name for name in LISTS]
 
 
@@ -140,13 +140,13 @@ def _check_together(options: argparse.Namespace) -> None:
     photos = _given(options, (*PHOTOS, "kind"))
     for name in ("encoders", "insist"):
         if getattr(options, name) and options.method == "sequential":
-            raise ConfigError(f"--{name} goes with --method joint; the sequential method does as the paper does")
+            raise ConfigError(f"--{name} goes with --method joint; the sequential method is the paper's")
     if options.rig is not None:
         if photos:
             raise ConfigError(f"--{photos[0]} goes with --from DIR; with --rig, the board is in rig.toml")
         return
     if session := _given(options, SESSION):
-        raise ConfigError(f"--{session[0]} goes with --rig; saved captures have what they have")
+        raise ConfigError(f"--{session[0]} goes with --rig; it does not change saved captures")
     if options.captures is not None:
         raise ConfigError("--captures goes with --rig; saved captures are read with --from DIR alone")
     if photos:
@@ -154,9 +154,9 @@ def _check_together(options: argparse.Namespace) -> None:
             raise ConfigError(f"plain photos need --{missing[0]} too: --fixed, --zoom, --board and --square")
         check_square(options.square, "--square")
         if options.encoders:
-            raise ConfigError("--encoders goes with --rig or saved captures; plain photos know nothing of a head")
+            raise ConfigError("--encoders goes with --rig or saved captures; plain photos have no head angles")
     elif not options.source.is_dir():
-        raise ConfigError(f"{options.source}: no such folder; --from takes one of captures or photos")
+        raise ConfigError(f"{options.source}: no such folder; --from takes a folder of captures or photos")
     elif not (options.source / "index.json").exists():
         raise ConfigError(
             f"{options.source}: holds no index.json of captures; photos need --fixed, --zoom, --board and --square"

@@ -34,23 +34,8 @@ def naming(where: object) -> Iterator[None]:
         raise ConfigError(f"{where}: {error}") from None
 
 
-def add_insist(parser: argparse.ArgumentParser) -> None:
-    """Add the option that accepts an implausible calibration."""
-    parser.add_argument("--insist", action="store_true", help="accept what is far outside of anything plausible")
-
-
 def load_plausible(path: Path, spec: "RigSpec | None" = None, *, insist: bool) -> "Calibration":
-    """Load a calibration and refuse an implausible one.
-
-    Args:
-        path: calibration.json.
-        spec: description of the rig in use; None where there is none.
-        insist: whether to accept it all the same.
-
-    Raises:
-        CalibrationError: the file is malformed or implausible; the message names the file and the key.
-        ConfigError: a stream has another aspect ratio than that calibrated.
-    """
+    """Load a calibration; refuse one that is implausible, by itself or for a rig, unless the user insists."""
     from cotarget.calibration import load_calibration
     from cotarget.calibration.plausibility import implausibility
 
@@ -80,12 +65,9 @@ def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:
 
 
 def check_board_size(rig: Path, config: "RigConfig") -> None:
-    """Refuse a rig whose board has squares of metres, and a real one whose configuration does not give their size.
+    """Refuse a board whose squares were given in millimetres, and a real one whose squares have no size in rig.toml.
 
-    All lengths of a calibration are multiples of that size, so that no later check can find it wrong.
-
-    Raises:
-        ConfigError: the size is missing, or in millimetres.
+    All lengths of a calibration are multiples of that size, so no later check can find it wrong.
     """
     from cotarget.config import check_square, read_tables
 
@@ -99,18 +81,14 @@ def check_board_size(rig: Path, config: "RigConfig") -> None:
 
 # Progress and results
 
-REMARK_S = 30.0  # between lines of progress where stderr is not a terminal [s]
+PROGRESS_LINE_S = 30.0  # interval of lines of progress where stderr is not a terminal [s]
 
 
 @contextmanager
 def progress_bar(now: Callable[[], float] = time.monotonic) -> "Iterator[Progress]":
-    """Show progress on stderr: a bar on a terminal, otherwise an occasional line.
-
-    Args:
-        now: gives the time [s].
-    """
+    """Show progress on stderr: a bar on a terminal, otherwise an occasional line."""
     if not sys.stderr.isatty():
-        yield _remarks(now)
+        yield _progress_lines(now)
         return
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -127,20 +105,20 @@ def progress_bar(now: Callable[[], float] = time.monotonic) -> "Iterator[Progres
         yield show
 
 
-def _remarks(now: Callable[[], float]) -> "Progress":
+def _progress_lines(now: Callable[[], float]) -> "Progress":
     """Print progress as lines, at most one every half a minute, so that short work prints nothing."""
     begin = last = now()
 
-    def remark(done: float, total: float | None, text: str) -> None:
+    def show(done: float, total: float | None, text: str) -> None:
         nonlocal last
-        if (t := now()) - last < REMARK_S:
+        if (t := now()) - last < PROGRESS_LINE_S:
             return
         last = t
         with contextlib.suppress(OSError):  # the reader of stderr may be closed; the work goes on
             part = "" if total is None else f"{100 * min(done / max(total, 1), 1):.0f} %, "
             print(f"{text} ({part}{t - begin:.0f} s)", file=sys.stderr, flush=True)
 
-    return remark
+    return show
 
 
 def print_json(table: Any, csv: Path | None = None) -> None:
@@ -166,15 +144,9 @@ def scores_of(
     *,
     whole: bool = True,
 ) -> dict[str, Any]:
-    """Score tracks against the labels of a file; empty without labels.
+    """Score tracks against the labels of a file, by frame; empty without labels.
 
-    Args:
-        file: file of the labels.
-        tracks: the tracks.
-        labels: the labels by frame; None where there are none.
-        rate_hz: frame rate [Hz].
-        frames: number of frames.
-        whole: whether no frame is missing at the end.
+    ``whole`` is false for a film that ends too early, whose last labels are then no sign of another film's.
     """
     from cotarget.metrics import score_tracks
 
@@ -200,9 +172,6 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None],
         outputs: files to write.
         inputs: files that are read, and folders whose contents must not change.
         folder: new folder to write, which may not contain any output.
-
-    Raises:
-        ConfigError: an output is refused; the message names the first one.
     """
     taken = {_real(path) for path in inputs if path is not None}
     if folder is not None:
@@ -218,7 +187,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None],
         if path.exists() and not path.is_file():
             raise ConfigError(f"{path}: is a device or a pipe, not a file; name the file to write")
         if _is_stdout_or_stderr(path):
-            raise ConfigError(f"{path}: is where this command's own words go; name another file to write")
+            raise ConfigError(f"{path}: is this command's own stdout or stderr; name another file to write")
         if (goal := behind_link(path)).is_symlink():
             raise ConfigError(f"{path}: is a link to itself; name the file to write")
         if goal.parent.exists() and not goal.parent.is_dir():
@@ -254,9 +223,6 @@ def previous_kept(path: Path) -> Iterator[None]:
     """Keep an earlier output under another name while the block writes a new one; print that name.
 
     Both files are complete at every moment. If the block fails, the earlier file stays and the other name is removed.
-
-    Raises:
-        ConfigError: the earlier file cannot be kept.
     """
     kept = _second_name(behind_link(path))
     try:
@@ -266,7 +232,7 @@ def previous_kept(path: Path) -> Iterator[None]:
             kept.unlink(missing_ok=True)
         raise
     if kept is not None:
-        print(f"{path}: the one of before is kept as {kept}", file=sys.stderr)
+        print(f"{path}: the earlier one is kept as {kept}", file=sys.stderr)
 
 
 def _second_name(path: Path) -> Path | None:
@@ -285,19 +251,14 @@ def _second_name(path: Path) -> Path | None:
 # Values of options
 
 
-def check_within(option: str, value: float, bounds: tuple[float, float], of: str, slack: float = 0.0) -> None:
-    """Refuse a value outside a device's limits.
+def check_within(option: str, value: float, bounds: tuple[float, float], whose: str, slack: float = 0.0) -> None:
+    """Refuse an option's value outside a device's limits, with some slack because the limits are printed rounded.
 
-    Args:
-        option: name of the option, for the message.
-        value: value of the option.
-        bounds: lowest and highest value, in the option's unit.
-        of: description and unit of the bounds for the message, with `{}` in their place.
-        slack: tolerance, because bounds are printed rounded.
+    ``whose`` names the device and the unit, with `{}` in place of the limits.
     """
     low, high = bounds
     if not low - slack <= value <= high + slack:
-        raise ConfigError(f"{option}: {value:g} is beyond {of.format(f'{low:g} to {high:g}')}")
+        raise ConfigError(f"{option}: {value:g} is beyond {whose.format(f'{low:g} to {high:g}')}")
 
 
 def number(text: str) -> float:
@@ -324,25 +285,19 @@ def duration(text: str) -> float:
     return math.inf if text == "inf" else positive(text)
 
 
-def not_negative(text: str) -> int:
-    """Parse a whole number of at least 0."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0")
-    return int(text)
+def whole(lowest: int, highest: float = math.inf) -> Callable[[str], int]:
+    """Make a parser of whole numbers between two limits."""
+
+    def parse(text: str) -> int:
+        if not (text.isdecimal() and lowest <= int(text) <= highest):
+            raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from {lowest}{up_to}")
+        return int(text)
+
+    up_to = "" if math.isinf(highest) else f" to {highest:g}"
+    return parse
 
 
-def positive_int(text: str) -> int:
-    """Parse a whole number of at least 1."""
-    if not (text.isdecimal() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1")
-    return int(text)
-
-
-def port(text: str) -> int:
-    """Parse a TCP port; 0 stands for any free one."""
-    if not (text.isdecimal() and int(text) < 65536):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a port, 0 to 65535")
-    return int(text)
+port = whole(0, 65535)  # a TCP port; 0 stands for any free one
 
 
 def board_corners(text: str) -> tuple[int, int]:

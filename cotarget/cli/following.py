@@ -1,7 +1,6 @@
 """Commands that run the pipeline on a rig: follow, and replay of a recording.
 
-Observers see every step of a run, and say at its end what the user must know: `Selection`, `Reasons`, `StepCounts` and
-`LensAtItsEnd`.
+Observers see every step of a run and warn at its end: `Selection`, `Reasons`, `StepCounts` and `LensAtItsEnd`.
 """
 
 import argparse
@@ -23,11 +22,11 @@ from cotarget.cli.common import (
     naming,
     number,
     open_named,
-    positive_int,
     print_json,
     progress_bar,
     rig_files,
     scores_of,
+    whole,
 )
 from cotarget.errors import ConfigError, choices
 from cotarget.files import STDOUT, CsvFile
@@ -183,8 +182,8 @@ class Observer(Protocol):
 def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
     """Follow a target with progress, table and film.
 
-    However the run ends, the head is halted first. The files are completed afterwards, with the steps up to then. A run
-    of unknown length ends by Ctrl-C.
+    However the run ends, the head is halted before the files are completed. Ctrl-C is the usual end of a run whose
+    length is unknown.
     """
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
@@ -211,7 +210,7 @@ def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
             if film is not None:
                 film.epoch = epoch
             selector = run.selection.selector
-            # The commands have checked calibration and target; a recorded run is replayed with whatever it had.
+            # insist: `follow` has checked calibration and target, and a replay takes those of the recorded run.
             steps = follow(rig, run.calibration, target, detector, selector=selector, seconds=run.seconds, insist=True)
             try:
                 for step in until_end(steps, run.replay):
@@ -271,10 +270,10 @@ def _hint_if_unseen(command: str, run: Run, counts: "StepCounts") -> None:
 
 # Observers
 
-NEVER_CONFIRMED, NOBODY_FOLLOWED = 3, 4  # exit statuses of `follow`
-# What is usual for a moment is reported if it holds in this share of the steps and in at least this number.
+NEVER_CONFIRMED, NOTHING_FOLLOWED = 3, 4  # exit statuses of `follow`
+# A reason that is usual for a moment is reported from this share and this number of the steps on,
 MOST, MANY = 0.5, 25
-# Anything else is reported from this share of the steps on.
+# and any other reason from this share and this number on.
 SOME, FEW = 0.05, 5
 
 
@@ -319,7 +318,7 @@ class StepCounts:
     def exit_status(self) -> int:
         """Exit status of `follow`: 0 if a target was followed and, where there was time for it, confirmed."""
         if not any(self.states[name] for name in ("following", "coasting", "unconfirmed")):
-            return NOBODY_FOLLOWED
+            return NOTHING_FOLLOWED
         # A wrong match in a few frames confirms nothing; a target hidden from the zoom camera for a while was confirmed
         # before or after.
         return NEVER_CONFIRMED if self.states["unconfirmed"] > self.confirmed else 0
@@ -334,10 +333,9 @@ class StepCounts:
 
 
 class LensAtItsEnd:
-    """Count of the steps in which the lens's range kept it from the wanted size."""
+    """Steps in which the lens's range did not allow the wanted size."""
 
     def __init__(self, name: str, target: "TargetProfile") -> None:
-        """Start to count for a target of this name."""
         self._name, self._target = name, target
         self._steps = 0
         self._shown_px: list[float] = []
@@ -366,17 +364,11 @@ class LensAtItsEnd:
 
 
 class TracksByImage:
-    """The confirmed tracks of a replay, by the numbers of the recorded images.
-
-    Attributes:
-        tracks: the tracks so far.
-        warning: always empty.
-    """
+    """The confirmed tracks of a replay, with the numbers of the recorded images, which are given by exposure time."""
 
     warning = ""
 
     def __init__(self, numbers: Mapping[float, int]) -> None:
-        """Collect the tracks of images with these numbers, by their exposure time [s]."""
         self._numbers = numbers
         self.tracks: list[Tracked] = []
 
@@ -442,7 +434,7 @@ class Reasons:
         return " ".join("; ".join(lines).split())  # a device's message may have several lines
 
     def _is_wrong(self, name: str, count: int) -> bool:
-        """Check whether a reason held in too many frames; a usual one counts after the first sighting."""
+        """Whether a reason held in too many frames."""
         if name.startswith(USUAL):
             return self._later[name] >= max(MANY, MOST * self._later_steps)
         return count >= max(FEW, SOME * self._steps)
@@ -450,12 +442,12 @@ class Reasons:
 
 # Selection of the target
 
-# Names of `cotarget.control.selection`, which --help does not import; the paper's first.
+# Names of `cotarget.control.selection`, which --help must not import; the paper's policy is the first.
 POLICIES = ("first-come", "nearest-deadline", "most-served")
 
 
 def add_selection(parser: argparse.ArgumentParser, default: str = POLICIES[0]) -> None:
-    """Add the options that select the target to follow; ``default`` is named in the help."""
+    """Add the options that select the target to follow; the help names the default."""
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--policy",
@@ -471,7 +463,7 @@ def add_selection(parser: argparse.ArgumentParser, default: str = POLICIES[0]) -
         help="follow only the target at this pixel of the fixed image: the first confirmed track at or near it",
     )
     which.add_argument(
-        "--track", type=positive_int, metavar="N", help="follow only the track with this id, as in video and table"
+        "--track", type=whole(1), metavar="N", help="follow only the track with this id, as in video and table"
     )
 
 
@@ -485,12 +477,7 @@ class Selection:
     def __init__(
         self, options: argparse.Namespace, size: tuple[int, int], recorded: Mapping[str, Any] | None = None
     ) -> None:
-        """Read the options.
-
-        Args:
-            options: parsed arguments with the options of `add_selection`.
-            size: (width, height) of the fixed camera's image [px].
-            recorded: table of the selector of a recorded run, used where no option is given.
+        """Make the selector of the options, or of the recorded run where none is given; `size` is the fixed image's.
 
         Raises:
             ConfigError: the click is outside the fixed camera's image, or a recording's policy is unknown.

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cotarget.cli import calibrating, following, operating, running
-from cotarget.cli.common import add_insist, board_corners, duration, not_negative, number, port, positive, positive_int
+from cotarget.cli.common import board_corners, duration, number, port, positive, whole
 from cotarget.cli.following import add_selection
 from cotarget.errors import CotargetError
 
@@ -27,15 +27,15 @@ class Parser(argparse.ArgumentParser):
     """Argument parser whose errors end in one line.
 
     Attributes:
-        more: gives the last paragraph of --help; called only when help is printed.
+        make_epilog: gives the last paragraph of --help; called only when help is printed.
     """
 
-    more: Callable[[], str] | None = None
+    make_epilog: Callable[[], str] | None = None
 
     def format_help(self) -> str:
-        """Format the help, with the paragraph from ``more`` at its end."""
-        if self.more is not None:
-            self.epilog = self.more()
+        """Format the help, with the paragraph of ``make_epilog`` at its end."""
+        if self.make_epilog is not None:
+            self.epilog = self.make_epilog()
         return super().format_help()
 
     def error(self, message: str) -> NoReturn:
@@ -60,9 +60,8 @@ INTERRUPTED = 130  # a shell's exit status for Ctrl-C
 TERMINATED = 143  # for SIGTERM
 HUNG_UP = 129  # for SIGHUP, from a closed terminal or a broken connection
 KINDS = ("chessboard", "charuco")  # kinds of calibration board
-# The matrices here are small: a second thread of linear algebra only waits for the first, up to a hundred times longer
-# than the work takes where other programs use the cores. Read when numpy is loaded; OPENBLAS_NUM_THREADS, if a user has
-# set it, goes before it.
+# The matrices here are small: where other programs use the cores, a second thread of linear algebra makes the work up
+# to 100 times slower. numpy reads the variable when it is imported; a user's OPENBLAS_NUM_THREADS takes precedence.
 ONE_THREAD = ("OMP_NUM_THREADS", "1")
 
 
@@ -84,22 +83,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except CotargetError as error:
         text = str(error)
-        if getattr(options, "rig", None) is not None:  # whose name the safety layer does not know
+        if getattr(options, "rig", None) is not None:  # the safety layer does not know the file's name
             text = text.replace("--rig FILE", f"--rig {options.rig}")
-        _say(options.command, text, error)
+        _print_end(options.command, text, error)
         return 1
     except BrokenPipeError:
         return 1
     except OSError as error:  # not caught by the commands' own checks, such as a full disk
         where = "" if error.filename is None else f"{error.filename}: "
-        _say(options.command, f"{where}{error.strerror or error}", error)
+        _print_end(options.command, f"{where}{error.strerror or error}", error)
         return 1
     except KeyboardInterrupt as end:
-        _say(options.command, "interrupted", end)
+        _print_end(options.command, "interrupted", end)
         return INTERRUPTED
     except SystemExit as end:
         if _notes(end):
-            _say(options.command, "terminated", end)
+            _print_end(options.command, "terminated", end)
         raise
 
 
@@ -112,8 +111,8 @@ class StderrHandler(logging.Handler):
             print(self.format(record), file=sys.stderr)
 
 
-def _say(command: str, text: str, end: BaseException) -> None:
-    """Print in one line how a command ended, with the notes on which files are unchanged."""
+def _print_end(command: str, text: str, end: BaseException) -> None:
+    """Print in one line how a command ended, with the notes on the files that it was writing."""
     with contextlib.suppress(OSError):  # the terminal may be closed
         print("; ".join([f"cotarget {command}: {text}", *_notes(end)]), file=sys.stderr)
 
@@ -152,9 +151,12 @@ def make_parser() -> argparse.ArgumentParser:
         file_option(made, "--csv", "write one line a step; -: to stdout")
         file_option(made, "--video", "write a side-by-side video (.mp4)")
 
+    def insist(made: Parser) -> None:
+        made.add_argument("--insist", action="store_true", help="accept what is far outside of anything plausible")
+
     demo = command("demo", running.demo_command, "calibrate a simulated rig and follow a book, a person and a bird")
     file_option(demo, "--out", "where to write (demo-out)", "DIR", default=Path("demo-out"))
-    demo.add_argument("--seed", type=not_negative, default=0, help="seed of everything random (0)")
+    demo.add_argument("--seed", type=whole(0), default=0, help="seed of everything random (0)")
 
     calibrate = command(
         "calibrate", calibrating.calibrate_command, "calibrate from a rig, from saved captures, or from plain photos"
@@ -174,13 +176,13 @@ def make_parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--kind", choices=KINDS, help=f"kind of the board on photos ({KINDS[0]})")
     calibrate.add_argument(
         "--placements",
-        type=positive_int,
+        type=whole(1),
         metavar="N",
         help="with --rig: number of board placements at the shortest focal length, at least 7 (30)",
     )
     calibrate.add_argument(
         "--stops",
-        type=positive_int,
+        type=whole(1),
         metavar="N",
         help="with --rig: number of zoom samples, more where they are too far apart; 1: shortest alone, otherwise with "
         "6 more placements far away (8)",
@@ -201,7 +203,7 @@ def make_parser() -> argparse.ArgumentParser:
     report = command("report", calibrating.report_command, "write a page on how far a calibration can be trusted")
     file_option(report, "calibration", "calibration.json")
     file_option(report, "--out", "file to write (report.html)", "PAGE", default=Path("report.html"))
-    add_insist(report)
+    insist(report)
 
     about = "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout"
     aim = command("aim", operating.aim_command, about)
@@ -223,7 +225,7 @@ def make_parser() -> argparse.ArgumentParser:
         default="exact",
         help="inverse kinematics: exact, or a reading of the paper's shortcut (exact)",
     )
-    add_insist(aim)
+    insist(aim)
 
     follow = command("follow", following.follow_command, "follow a target with a calibrated rig")
     file_option(follow, "--rig", "rig.toml", required=True)
@@ -233,8 +235,8 @@ def make_parser() -> argparse.ArgumentParser:
     follow.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
     outputs(follow)
     file_option(follow, "--record", "record everything, for cotarget replay", "DIR")
-    add_insist(follow)
-    follow.more = lambda: FOLLOW_STATUSES
+    insist(follow)
+    follow.epilog = FOLLOW_STATUSES
 
     replay = command("replay", following.replay_command, "run the pipeline again on a recording of follow --record")
     file_option(replay, "recording", "folder of the recording", "DIR")
@@ -259,7 +261,7 @@ def make_parser() -> argparse.ArgumentParser:
     file_option(latency, "--rig", "rig.toml", required=True)
     about = "calibration.json; measures the fixed camera too, by a board that is swung"
     file_option(latency, "--calibration", about)
-    add_insist(latency)
+    insist(latency)
 
     about = "emergency stop of every rig that watches this rig.toml's stop file"
     stop = command("stop", operating.stop_command, about)
@@ -287,14 +289,14 @@ def make_parser() -> argparse.ArgumentParser:
     about = "fault to be on from the start, one of those below; the control socket switches faults later"
     emulate.add_argument("--fault", action="append", default=[], metavar="DEVICE.FAULT", help=about)
     emulate.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
-    emulate.more = operating.fault_names
+    emulate.make_epilog = operating.fault_names
 
     about = "show the simulated scene, both cameras' frusta and their images"
     view = command("view", running.view_command, about)
     file_option(view, "--rig", "rig.toml of the simulated rig (the default rig)")
     view.add_argument("--target", metavar="NAME", help="follow this target of rig.toml")
     file_option(view, "--calibration", "calibration.json (the simulation's true calibration)")
-    add_insist(view)
+    insist(view)
     view.add_argument("--browser", action="store_true", help="serve a page for a web browser on this machine")
     view.add_argument("--port", type=port, metavar="P", help=f"port of the page; 0: any free one ({running.PORT})")
     view.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")

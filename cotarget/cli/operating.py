@@ -5,7 +5,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
@@ -24,6 +24,7 @@ from cotarget.errors import CalibrationError, ConfigError
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig, TargetProfile
+    from cotarget.targeting import Aim, WantedSize
 
 
 SMALL_PX = 10.0  # smaller sizes are printed with two digits, others as whole pixels
@@ -34,7 +35,6 @@ def aim_command(options: argparse.Namespace) -> None:
     import numpy as np
 
     from cotarget.backends import describe, load_config
-    from cotarget.calibration.joint import SAME_FOCAL
     from cotarget.config import RigConfig
     from cotarget.targeting import Reach, WantedSize, aim, error_budget, point_at
 
@@ -69,23 +69,10 @@ def aim_command(options: argparse.Namespace) -> None:
     found = aim(calibration, point, reach, wanted_size=wanted, nominal_px=nominal, method=options.ik)
     # The error budget holds for the exact inverse; the shortcut's additional error is not modelled.
     budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
-    calibrated = calibration.zoom_head.lens.nominal_px
-    within = calibrated[0] * (1 - SAME_FOCAL) <= found.nominal_px <= calibrated[-1] * (1 + SAME_FOCAL)
-    if not within:
-        _warn(
-            f"{found.nominal_px * pitch_mm:.1f} mm is beyond the focal lengths calibrated, "
-            f"{calibrated[0] * pitch_mm:.1f} to {calibrated[-1] * pitch_mm:.1f} mm: the prediction only guesses there"
-        )
-    nearest, name = min(_fits_from(calibration, config.targets if target is None else {options.target: target}))
-    plausible = found.depth >= nearest
-    if not plausible:
-        fits = f"no target, not even the {name}, fits" if target is None else f"the {name} does not fit"
-        _warn(f"{fits} into the fixed view nearer than {nearest:.2g} m: is a depth of {found.depth:g} m meant?")
+    is_calibrated = _check_focal_length(calibration, found, pitch_mm)
+    is_plausible = _check_depth(calibration, found, config.targets if target is None else {options.target: target})
     if wanted is not None and found.limited:
-        focal = calibration.zoom_head.lens.at(found.nominal_px).focal_px[int(wanted.vertical)]
-        shown_px, wanted_px = _pixels(focal * wanted.size / found.range), _pixels(wanted.wanted_px)
-        if shown_px != wanted_px:
-            _warn(f"the lens shows the {options.target} {shown_px} px large there, and not {wanted_px}")
+        _check_shown_size(calibration, found, wanted, options.target)
     print_json(
         {
             "pan_deg": math.degrees(found.pan),
@@ -93,14 +80,49 @@ def aim_command(options: argparse.Namespace) -> None:
             "focal_px": found.focal_px,
             "focal_mm": found.nominal_px * pitch_mm,
             "focal_limited": found.limited,
-            "focal_calibrated": within,
+            "focal_calibrated": is_calibrated,
             "depth_m": found.depth,
-            "depth_plausible": plausible,
+            "depth_plausible": is_plausible,
             "range_m": found.range,
             "predicted_error_deg": budget and {name: math.degrees(part) for name, part in budget.items()},
             "predicted_error_px": budget and math.tan(budget["total"]) * found.focal_px,
         }
     )
+
+
+def _check_focal_length(calibration: "Calibration", found: "Aim", pitch_mm: float) -> bool:
+    """Whether an aim's focal length is among those calibrated; warn if not."""
+    from cotarget.calibration.joint import SAME_FOCAL
+
+    nominal_px = calibration.zoom_head.lens.nominal_px
+    shortest, longest = nominal_px[0], nominal_px[-1]
+    if shortest * (1 - SAME_FOCAL) <= found.nominal_px <= longest * (1 + SAME_FOCAL):
+        return True
+    _warn(
+        f"{found.nominal_px * pitch_mm:.1f} mm is outside the calibrated focal lengths, {shortest * pitch_mm:.1f} to "
+        f"{longest * pitch_mm:.1f} mm: the aim is extrapolated"
+    )
+    return False
+
+
+def _check_depth(calibration: "Calibration", found: "Aim", targets: Mapping[str, "TargetProfile"]) -> bool:
+    """Whether one of the targets fits into the fixed view at an aim's depth; warn if none does."""
+    (width, height), (fx, fy) = calibration.fixed.size, calibration.fixed.lens.focal_px
+    nearest, name = min(
+        (target.size * (fy / height if target.is_vertical() else fx / width), name) for name, target in targets.items()
+    )
+    if found.depth >= nearest:
+        return True
+    _warn(f"the {name} fits into the fixed view only from {nearest:.2g} m on: is a depth of {found.depth:g} m meant?")
+    return False
+
+
+def _check_shown_size(calibration: "Calibration", found: "Aim", wanted: "WantedSize", name: str) -> None:
+    """Warn if the lens shows the target at another size than wanted, in whole pixels or two digits."""
+    focal = calibration.zoom_head.lens.at(found.nominal_px).focal_px[int(wanted.vertical)]
+    shown_px, wanted_px = _pixels(focal * wanted.size / found.range), _pixels(wanted.wanted_px)
+    if shown_px != wanted_px:
+        _warn(f"the lens shows the {name} {shown_px} px large there, and not {wanted_px}")
 
 
 def _target(options: argparse.Namespace, config: "RigConfig", calibration: "Calibration") -> "TargetProfile | None":
@@ -141,15 +163,7 @@ def _warn(text: str) -> None:
     print(f"cotarget aim: {text}", file=sys.stderr)
 
 
-def _fits_from(calibration: "Calibration", targets: Mapping[str, "TargetProfile"]) -> Iterator[tuple[float, str]]:
-    """Yield each target's least depth [m] at which it fits into the fixed view, and its name."""
-    for name, target in targets.items():
-        axis = int(target.is_vertical())
-        yield calibration.fixed.lens.focal_px[axis] * target.size / calibration.fixed.size[axis], name
-
-
 def _pixels(size: float) -> str:
-    """Format a size in pixels: whole pixels, or two digits for the smallest."""
     return f"{size:.2g}" if size < SMALL_PX else f"{size:.0f}"
 
 
@@ -157,7 +171,7 @@ def _pixels(size: float) -> str:
 
 # One thread for Mesa's software renderer leaves a core to the client. Mesa reads the variable when OpenGL starts.
 RENDER_THREADS = ("LP_NUM_THREADS", "1")
-LOOK = 0.2  # polling interval [s]
+POLL_S = 0.2
 # Python's switch interval [s]. With the default of 5 ms, a line that is paced by its own thread loses half of its rate
 # beside the rendering.
 SWITCH_S = 5e-4
@@ -216,14 +230,14 @@ def emulate_command(options: argparse.Namespace) -> None:
         end = None if options.seconds is None else time.monotonic() + options.seconds
         try:
             while end is None or time.monotonic() < end:
-                time.sleep(LOOK)
+                time.sleep(POLL_S)
                 emulation.world.check()
         except KeyboardInterrupt:
             print("", file=sys.stderr)
 
 
 CONSENT = "yes"
-ENOUGH_DIGITS = 4  # decimals of a latency [s]
+DIGITS = 4  # decimals of a latency [s]
 # Accuracy of a measured latency [s]; a more negative one is refused.
 ACCURACY_S = 0.01
 
@@ -237,7 +251,7 @@ def latency_command(options: argparse.Namespace) -> None:
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
     if config.backend == "replay":
-        raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's latencies cannot be measured any more")
+        raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's latencies cannot be measured")
     calibration = None
     if options.calibration is not None:  # refused before the head moves
         calibration = load_plausible(options.calibration, describe(config), insist=options.insist)
@@ -265,17 +279,13 @@ def latency_command(options: argparse.Namespace) -> None:
 
 
 def _plausible(name: str, seconds: float) -> float:
-    """Round a latency as it is written into rig.toml.
-
-    Raises:
-        CalibrationError: the latency is negative beyond the measurement's accuracy.
-    """
+    """Round a latency for rig.toml; refuse one that is negative beyond the measurement's accuracy."""
     if seconds < -ACCURACY_S:
         raise CalibrationError(
             f"{name}: {1000 * seconds:.0f} ms was measured, which is implausible: see that the picture has structure "
             "and that nothing else moves in it, and measure again"
         )
-    return max(round(seconds, ENOUGH_DIGITS), 0.0)
+    return max(round(seconds, DIGITS), 0.0)
 
 
 def point_command(options: argparse.Namespace) -> None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 PORT = 8080  # port of the page
-LOOKED_AT = ("person", "bird")  # targets of the scene without --rig and --target
+TARGETS = ("person", "bird")  # targets of the scene without --rig and --target
 
 
 def view_command(options: argparse.Namespace) -> None:
@@ -34,9 +34,9 @@ def view_command(options: argparse.Namespace) -> None:
     from cotarget.sim.world import SimWorld
 
     if options.port is not None and not options.browser:
-        raise ConfigError("--port: is of the page that --browser serves; give both")
+        raise ConfigError("--port: needs --browser, which serves a page at that port")
     if options.calibration is not None and options.target is None:
-        raise ConfigError("--calibration: is for following a target; name it: --target NAME")
+        raise ConfigError("--calibration: needs --target NAME, the target to follow")
     config = _config(options)
     calibration = None
     if options.calibration is not None:
@@ -46,27 +46,22 @@ def view_command(options: argparse.Namespace) -> None:
     with closing(world), closing(opened(world.truth())) as window:
         print(f"{window.where} shows the scene; Ctrl-C ends it", file=sys.stderr, flush=True)
         try:
-            watch(_sights(options, config, world, calibration), window, time.monotonic, time.sleep)
+            watch(_snapshots(options, config, world, calibration), window, time.monotonic, time.sleep)
         except KeyboardInterrupt:
             print("", file=sys.stderr)
 
 
-def watch(sights: "Iterator[Snapshot]", window: Any, now: Callable[[], float], sleep: Callable[[float], None]) -> None:
-    """Show snapshots in real time at most, until they end or the window is closed.
-
-    Args:
-        sights: snapshots in order of time.
-        window: window that shows them.
-        now: gives the wall-clock time [s].
-        sleep: waits for a duration [s].
-    """
+def watch(
+    snapshots: "Iterator[Snapshot]", window: Any, now: Callable[[], float], sleep: Callable[[float], None]
+) -> None:
+    """Show snapshots no faster than in real time, until they end or the window is closed."""
     ahead = math.inf  # lead of the rig's clock over the wall clock
-    for sight in sights:
-        window.show(sight)
+    for snapshot in snapshots:
+        window.show(snapshot)
         if not window.is_open():
             return
-        ahead = min(ahead, sight.t - now())  # a slow machine does not catch up afterwards
-        if (wait := sight.t - ahead - now()) > 0:
+        ahead = min(ahead, snapshot.t - now())  # a slow machine does not catch up afterwards
+        if (wait := snapshot.t - ahead - now()) > 0:
             sleep(wait)
 
 
@@ -81,7 +76,7 @@ def _config(options: argparse.Namespace) -> "RigConfig":
         if options.target is not None:
             with naming("--target"):  # an unknown one is refused before the long work
                 RigConfig().target(options.target)
-        targets = LOOKED_AT if options.target is None else (options.target,)
+        targets = TARGETS if options.target is None else (options.target,)
         return sim_config(SCENES.get(targets[0].rstrip("0123456789"), "outdoor"), targets, 0)
     config = load_config(options.rig)
     if config.backend != "sim":
@@ -95,11 +90,7 @@ def _config(options: argparse.Namespace) -> "RigConfig":
 
 
 def window_opener(options: argparse.Namespace) -> "Callable[[Truth], Any]":
-    """Give the function that opens a window on a world's truth.
-
-    Raises:
-        DeviceError: there is no display, no web viewer, or the port is in use.
-    """
+    """Return the function that opens a window on a world's truth; refuse a missing display and a port in use."""
     if options.browser:
         from cotarget.sim.viewer.browser import BrowserWindow, listen
 
@@ -110,10 +101,10 @@ def window_opener(options: argparse.Namespace) -> "Callable[[Truth], Any]":
     return DesktopWindow
 
 
-def _sights(
+def _snapshots(
     options: argparse.Namespace, config: "RigConfig", world: "SimWorld", calibration: "Calibration | None"
 ) -> "Iterator[Snapshot]":
-    """Give the snapshots: of the pipeline following a target, or of the rig at rest without one."""
+    """Yield snapshots of the pipeline following a target, or of the rig at rest."""
     from cotarget.evaluation import true_calibration
     from cotarget.safety.safe_rig import guard
 

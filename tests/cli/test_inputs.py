@@ -140,7 +140,7 @@ def test_where_the_result_is_printed_no_other_is_written(folder, capsys, tmp_pat
                 os.dup2(kept, stream)
                 os.close(kept)
             assert status == 1
-            assert "is where this command's own words go" in err
+            assert "is this command's own stdout or stderr" in err
 
 
 def test_a_link_to_a_result_is_written_through(folder, capsys, tmp_path):

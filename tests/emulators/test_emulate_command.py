@@ -47,7 +47,7 @@ def test_an_earlier_rig_toml_is_kept(folder, capsys):
     (folder / "mine.toml").write_text("[sim]\n")
     status, _, err = call(capsys, "emulate", "--write", "mine.toml", "--seconds", "0.01")
     assert status == 0
-    assert err == "mine.toml: the one of before is kept as mine.previous-1.toml\n"
+    assert err == "mine.toml: the earlier one is kept as mine.previous-1.toml\n"
     assert (folder / "mine.previous-1.toml").read_text() == "[sim]\n"
     written = load_config(folder / "mine.toml")
     assert (written.backend, written.board) == ("hardware", RigConfig().board)
