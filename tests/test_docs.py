@@ -29,7 +29,7 @@ def test_every_name_exists(page):
     assert [name for name in sorted(names) if not exists(name)] == []
 
 
-def test_what_upgrading_leads_to_exists():
+def test_new_names_in_upgrading_exist():
     rows = re.findall(
         r"^\| `[\w.]+` \| `(cotarget[\w.]+)` \|$", (ROOT / "docs/upgrading.md").read_text("utf-8"), re.MULTILINE
     )

@@ -46,7 +46,7 @@ def write_film(path, frames, error=None, keep=False):
 @pytest.mark.parametrize(
     "error", [KeyboardInterrupt(), SystemExit(143), ConfigError("the camera is gone"), ValueError()]
 )
-def test_what_there_is_can_be_kept_after_an_error_which_says_so(tmp_path, name, write, error):
+def test_partial_result_is_kept_after_an_error_with_a_note(tmp_path, name, write, error):
     error.__dict__.pop("__notes__", None)
     path = tmp_path / name
     path.write_text("old")
@@ -68,7 +68,7 @@ def test_what_there_is_can_be_kept_after_an_error_which_says_so(tmp_path, name, 
 
 
 @pytest.mark.parametrize("keep", [True, False])
-def test_a_disk_that_is_full_from_the_beginning_leaves_the_old_table(tmp_path, keep):
+def test_full_disk_leaves_the_old_table(tmp_path, keep):
     path = tmp_path / "a.csv"
     path.write_text("old")
     with full_disk(), pytest.raises(ConfigError, match=f"a.csv: .*{SAID}"):
@@ -77,7 +77,7 @@ def test_a_disk_that_is_full_from_the_beginning_leaves_the_old_table(tmp_path, k
     assert names(tmp_path) == ["a.csv"]
 
 
-def test_a_table_on_a_disk_that_gets_full_keeps_its_whole_lines(tmp_path):
+def test_table_on_a_filling_disk_keeps_its_complete_lines(tmp_path):
     """The name of the column and 3 lines of "9\\r\\n" are 12 bytes, and the next is cut."""
     path = tmp_path / "a.csv"
     with full_disk(14), pytest.raises(ConfigError, match=r"a\.csv: ") as caught:
@@ -86,7 +86,7 @@ def test_a_table_on_a_disk_that_gets_full_keeps_its_whole_lines(tmp_path):
     assert path.read_text().split() == ["n", "0", "1", "2"]
 
 
-def test_a_film_of_which_the_disk_holds_nothing_is_not_there(tmp_path):
+def test_film_without_room_for_its_header_is_removed(tmp_path):
     path = tmp_path / "a.mp4"
     with full_disk(1000), pytest.raises(KeyboardInterrupt) as caught:
         write_film(path, 3, KeyboardInterrupt(), keep=True)
@@ -123,7 +123,7 @@ def full_at(path, size, part):
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
-def test_a_film_on_a_disk_that_gets_full_can_be_played_up_to_there(tmp_path, suffix):
+def test_film_on_a_filling_disk_can_be_played_up_to_there(tmp_path, suffix):
     whole, path = tmp_path / f"whole{suffix}", tmp_path / f"a{suffix}"
     noisy_film(whole, 6)
     size = whole.stat().st_size
@@ -141,7 +141,7 @@ def test_a_film_on_a_disk_that_gets_full_can_be_played_up_to_there(tmp_path, suf
     ("a.csv", lambda path: CsvFile(path, ("n",))),
     ("a.mp4", lambda path: FilmWriter(path, 25.0)),
 ])  # fmt: skip
-def test_a_second_run_on_the_same_result_is_refused(tmp_path, name, make):
+def test_second_run_on_the_same_result_is_refused(tmp_path, name, make):
     path = tmp_path / name
     (tmp_path / "link").symlink_to(path)
     with make(path):
@@ -153,7 +153,7 @@ def test_a_second_run_on_the_same_result_is_refused(tmp_path, name, make):
         pass
 
 
-def test_small_files_wait_for_each_other(tmp_path):
+def test_small_file_waits_for_another_run(tmp_path):
     """Each of them is whole afterwards; a run that goes on writing is refused in the end."""
     path = tmp_path / "a.json"
     first = PartFile(path)
@@ -171,7 +171,7 @@ def test_small_files_wait_for_each_other(tmp_path):
     assert names(tmp_path) == ["a.json"]
 
 
-def test_who_waits_for_a_run_that_goes_on_is_refused(tmp_path, monkeypatch):
+def test_wait_for_another_run_ends_in_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr("cotarget.files.PATIENCE_S", 0.05)
     with CsvFile(tmp_path / "a.csv", ("n",)), pytest.raises(ConfigError, match="is being written by another run"):
         write_atomically(tmp_path / "a.csv", b"whole")
@@ -194,7 +194,7 @@ class Signalled:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_second_signal_while_a_film_is_completed_loses_nothing(tmp_path, monkeypatch, number):
+def test_second_signal_while_a_film_is_completed_loses_nothing(tmp_path, monkeypatch, number):
     """The first has ended the run; what comes while the file is completed says no more."""
     containers, plain = [], av.open
     monkeypatch.setattr(av, "open", lambda *a, **k: containers.append(Signalled(plain(*a, **k))) or containers[-1])
@@ -229,7 +229,7 @@ def _ctrl_c():
 
 
 @pytest.mark.usefixtures("_ctrl_c")
-def test_a_signal_while_a_file_is_completed_acts_afterwards(tmp_path):
+def test_signal_while_a_file_is_completed_acts_afterwards(tmp_path):
     path = tmp_path / "a.json"
     with pytest.raises(KeyboardInterrupt):
         complete(PartFile(path), signals=1)
@@ -237,7 +237,7 @@ def test_a_signal_while_a_file_is_completed_acts_afterwards(tmp_path):
 
 
 @pytest.mark.usefixtures("_ctrl_c")
-def test_one_who_insists_need_not_wait_for_a_file(tmp_path):
+def test_repeated_ctrl_c_abandons_a_file(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         complete(PartFile(tmp_path / "a.json"), signals=3)
     assert names(tmp_path) == []
@@ -264,7 +264,7 @@ os.kill(os.getpid(), 9)
 """
 
 
-def test_what_a_killed_run_has_left_can_be_read_and_is_taken_over(tmp_path):
+def test_part_file_of_a_killed_run_is_readable_and_reused(tmp_path):
     path = tmp_path / "a.csv"
     subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, check=False)
     assert names(tmp_path) == [".a.part.csv", ".a.part.mp4"]
@@ -276,7 +276,7 @@ def test_what_a_killed_run_has_left_can_be_read_and_is_taken_over(tmp_path):
     assert path.read_text().split() == ["n", "0"]
 
 
-def test_a_result_that_has_just_got_its_name_is_not_taken_for_a_part(tmp_path, monkeypatch):
+def test_renamed_part_file_is_not_locked_again(tmp_path, monkeypatch):
     """A second run opens the part of the first, which is renamed before it can lock it."""
     path = tmp_path / "a.csv"
     first, opened = PartFile(path), []
@@ -302,7 +302,7 @@ def test_a_result_that_has_just_got_its_name_is_not_taken_for_a_part(tmp_path, m
 
 
 @pytest.mark.parametrize("exists", [True, False])
-def test_a_link_stays_and_its_goal_is_written(tmp_path, exists):
+def test_link_is_kept_and_its_target_written(tmp_path, exists):
     (tmp_path / "far").mkdir()
     (tmp_path / "near").mkdir()
     goal, link = tmp_path / "far" / "goal.csv", tmp_path / "near" / "a.csv"
@@ -319,7 +319,7 @@ def test_a_link_stays_and_its_goal_is_written(tmp_path, exists):
     assert names(link.parent) == ["a.csv"]
 
 
-def test_a_picture_is_the_old_or_the_new_one(tmp_path):
+def test_picture_is_the_old_or_the_new_one(tmp_path):
     path = tmp_path / "a.png"
     write_picture(path, IMAGE)
     old = path.read_bytes()

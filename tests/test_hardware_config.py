@@ -33,11 +33,11 @@ def refusal(text):
 
 
 @pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in REFUSED.items() for value in values])
-def test_a_refused_value_is_told_by_its_key(key, value):
+def test_refused_value_is_named_by_its_key(key, value):
     assert refusal(f"hardware.{key} = {value}").startswith(f"hardware.{key}: ")
 
 
-def test_an_unknown_key_is_told_with_the_valid_ones_and_an_unknown_driver_with_the_known():
+def test_unknown_key_or_driver_is_named_with_the_valid_ones():
     said = refusal("hardware.head.buad = 9600")
     assert said.startswith("unknown key 'hardware.head.buad'; valid here: baud, command_delay_s, driver, pan_deg")
     assert refusal("hardware.camera.url = ''") == "unknown key 'hardware.camera'; valid here: board, fixed, head, zoom"
@@ -46,7 +46,7 @@ def test_an_unknown_key_is_told_with_the_valid_ones_and_an_unknown_driver_with_t
 
 @pytest.mark.parametrize("backend", ["hardware", "sim"])
 @pytest.mark.parametrize("camera", ["fixed", "zoom"])
-def test_a_latency_that_makes_every_frame_too_old_is_told_by_its_key(backend, camera):
+def test_latency_above_the_frame_age_limit_is_refused(backend, camera):
     text = f"backend = '{backend}'\nsafety.max_frame_age_s = 2.0\n{backend}.{camera}.latency_s = "
     check(parse_config(tomllib.loads(f"{text}1.9")))
     assert refusal(f"{text}20").startswith(f"{backend}.{camera}.latency_s: ")
@@ -64,7 +64,7 @@ def test_socket_addresses(url, address):
     assert socket_address(url) == address
 
 
-def test_a_head_of_which_nothing_is_said_counts_as_the_makers_manual_has_it():
+def test_default_head_signs_are_those_of_a_ptu_d46():
     """Positive pan of a PTU-D46 turns left, where a rig's turns right; positive tilt goes up for both."""
     head = devices(HardwareConfig())["head"].settings
     assert (head.pan_sign, head.tilt_sign) == (-1, 1)

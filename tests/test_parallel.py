@@ -33,23 +33,23 @@ def wait_for_ever(pipe_end, report):
     os.read(pipe_end, 1)
 
 
-def test_the_result_comes_after_all_that_was_reported():
+def test_result_comes_after_the_reports():
     told = []
     assert run_apart(square, (3,), lambda *given: told.append(given)) == 9
     assert told == [("squaring", 1, 1)]
 
 
-def test_a_jobs_own_error_is_raised():
+def test_error_of_a_job_is_raised():
     with pytest.raises(ConfigError, match="7 is wrong"):
         run_apart(refuse, (7,), lambda *_: None)
 
 
-def test_a_job_that_dies_is_an_error():
+def test_dead_job_is_an_error():
     with pytest.raises(CotargetError, match=r"ended before it was done \(exit status 3\)"):
         run_apart(die, (1,), lambda *_: None)
 
 
-def test_an_interrupt_ends_the_jobs():
+def test_interrupt_ends_the_jobs():
     def interrupt(*_):
         raise KeyboardInterrupt
 
@@ -89,7 +89,7 @@ def is_deaf(heard, report):
     return heard == signal.SIG_IGN
 
 
-def test_jobs_that_begin_do_not_hear_an_interrupt():
+def test_starting_jobs_ignore_an_interrupt():
     before = signal.getsignal(signal.SIGINT)
     assert run_apart(is_deaf, (Hearing(),), lambda *_: None) is True
     assert signal.getsignal(signal.SIGINT) == before

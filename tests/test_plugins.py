@@ -160,7 +160,7 @@ def rig(tmp_path):
     return tmp_path / "rig.toml"
 
 
-def test_a_rig_of_own_devices_is_opened_from_rig_toml_alone(rig, monkeypatch):
+def test_rig_of_own_devices_is_opened_from_rig_toml(rig, monkeypatch):
     monkeypatch.chdir("/")
     config = load_config(rig)
     assert describe(config).zoom.focal_range == (100.0, 400.0)
@@ -170,7 +170,7 @@ def test_a_rig_of_own_devices_is_opened_from_rig_toml_alone(rig, monkeypatch):
         assert opened.spec.head.limits.pan == (-1.0, 1.0)
 
 
-def test_the_commands_know_them(rig, capsys, monkeypatch):
+def test_commands_and_doctor_use_own_devices(rig, capsys, monkeypatch):
     monkeypatch.chdir("/")
     assert main(["point", "--rig", str(rig), "--pan-deg", "5"]) == 0
     assert json.loads(capsys.readouterr().out)["pan_deg"] == pytest.approx(5)
@@ -180,7 +180,7 @@ def test_the_commands_know_them(rig, capsys, monkeypatch):
     assert found["targets.wall.detector"].ok
 
 
-def test_an_own_detector_is_found_beside_rig_toml(rig, monkeypatch):
+def test_own_detector_beside_rig_toml_is_found(rig, monkeypatch):
     monkeypatch.chdir("/")
     detector = make_detector(load_config(rig).target("wall"), 25.0)
     [found] = detector.detect(Frame(np.full((48, 64, 3), 9, np.uint8), 0.0))
@@ -244,7 +244,7 @@ def with_other(rig, device, body):
     ("fixed", "read", "Frame(np.zeros((48, 64), np.uint8), 0.0)", ""),
     ("fixed", "read", "Frame(np.zeros((48, 64, 3)), 0.0)", ""),
 ])  # fmt: skip
-def test_an_answer_of_another_kind_is_one_line_that_names_device_and_method(rig, device, method, answer, wanted):
+def test_wrong_return_value_is_named_by_device_and_method(rig, device, method, answer, wanted):
     with_other(rig, device, f"    def {method}(self, *a, **k):\n        return {answer}\n")
     arguments = {"move": (0.1, 0.2), "zoom": (200.0,)}.get(method, ())
     with pytest.raises(DeviceError) as caught, open_rig(rig) as opened:
@@ -258,7 +258,7 @@ def test_an_answer_of_another_kind_is_one_line_that_names_device_and_method(rig,
     ("head", "limits", "((-1.0, 1.0), (-0.5, 0.5))"), ("fixed", "size", "None"), ("fixed", "size", "[64, 48]"),
     ("zoom", "size", "(64.0, 48.0)"), ("zoom", "still_size", "(0, 48)"), ("zoom", "focal_range", "(400.0, 100.0)"),
 ])  # fmt: skip
-def test_an_attribute_of_another_kind_is_one_line_and_the_device_is_closed(rig, device, name, wrong):
+def test_wrong_attribute_is_named_and_the_device_closed(rig, device, name, wrong):
     body = f"""
     def __setattr__(self, name, value):
         if name != {name!r}:
@@ -331,6 +331,6 @@ def test_an_own_file_may_have_the_name_of_another_module(rig):
     assert colorsys.rgb_to_hls(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0)
 
 
-def test_a_module_on_pythons_path_needs_no_file_beside_rig_toml(rig, tmp_path, monkeypatch):
+def test_module_on_pythons_path_is_found(rig, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(rig.parent))
     check(parse_config({"hardware": {"fixed": {"driver": "devices:Camera", "colour": "blue"}}}))

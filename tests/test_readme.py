@@ -107,7 +107,7 @@ def file_of(page, name):
     return found
 
 
-def test_target_and_scene_of_ones_own_are_there_as_shown(tmp_path):
+def test_own_target_and_scene_of_the_docs_appear(tmp_path):
     for name in ("rig.toml", "yard.xml"):
         (tmp_path / name).write_text(file_of("targets-and-scenes.md", name))
     (tmp_path / "dog.obj").write_text(BOX)

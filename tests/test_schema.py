@@ -41,7 +41,7 @@ class Camera:
     points: tuple[Annotated[tuple[int, float], "[u, v]"], ...] = ()
 
 
-def test_what_a_file_has_becomes_a_frozen_dataclass():
+def test_table_becomes_a_frozen_dataclass():
     table = {
         "name": "a",
         "rate_hz": 12,
@@ -60,7 +60,7 @@ def test_what_a_file_has_becomes_a_frozen_dataclass():
         camera.rate_hz = 3.0
 
 
-def test_a_base_gives_what_the_table_does_not_say():
+def test_missing_keys_are_taken_from_the_base():
     base = Camera("a", rate_hz=5.0)
     assert validate(Camera, {"quality": 3}, "camera", base=base) == Camera("a", rate_hz=5.0, quality=3)
 
@@ -109,7 +109,7 @@ def test_missing_and_unknown_keys_are_named_with_the_valid_ones():
     assert refusal(Camera, []).startswith("camera: ")
 
 
-def test_a_plain_dataclass_is_read_as_strictly():
+def test_plain_dataclass_is_read_strictly():
     @dataclass(frozen=True)
     class Plain:
         rate_hz: float = 1.0
@@ -124,7 +124,7 @@ def test_a_plain_dataclass_is_read_as_strictly():
     ("source", 1.5, "source"), ("ports", {"left": True}, "ports.left"), ("gains", [1, "a"], "gains[1]"),
     ("gain", -1, "gain"), ("lens", {"foc": 1}, "lens"), ("sizes", 3, "sizes"),
 ])  # fmt: skip
-def test_a_value_that_is_none_of_several_types_is_one_line_that_names_the_key(key, value, at):
+def test_value_outside_a_union_is_one_line_that_names_the_key(key, value, at):
     @dataclass(frozen=True)
     class Own:
         source: int | str = 0

@@ -44,9 +44,7 @@ def calibrate_command(options: argparse.Namespace) -> None:
     check_outputs([], inputs, options.captures)
     check_outputs([options.out], [*inputs, *_lists(options.captures)])
     if config is not None and config.backend == "replay":
-        raise ConfigError(
-            f"{options.rig}: backend is 'replay'; calibrate from the captures of a session: --from DIR"
-        )
+        raise ConfigError(f"{options.rig}: backend is 'replay'; calibrate from the captures of a session: --from DIR")
     _check_together(options)
     check_writable(options.out)
     how = cal.Options(options.method, encoders=options.encoders, regularize=options.insist)

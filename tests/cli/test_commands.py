@@ -57,7 +57,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_a_machine_without_opengl(folder):
+def test_follow_without_opengl_names_the_package_to_install(folder):
     path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_OPENGL, *FOLLOW],
@@ -103,7 +103,7 @@ def test_aim_prints_json_with_the_documented_keys(folder, capsys):
     ("2", ["--target", "person"], "2.5 m"),  # 1.75 m have 480 px at 684 px focal length at 2.49 m
     ("2.6", ["--target", "person"], None),
 ])  # fmt: skip
-def test_a_depth_at_which_no_target_fits_into_the_view_is_doubted(folder, capsys, depth, more, nearest):
+def test_aim_warns_of_a_depth_at_which_no_target_fits(folder, capsys, depth, more, nearest):
     found, doubts = aim_json(capsys, "--depth", depth, *more)
     assert found["depth_plausible"] is (nearest is None)
     assert len(doubts) == (nearest is not None)
@@ -122,7 +122,7 @@ def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, ca
     assert len(doubts) == 1
 
 
-def test_a_close_up_that_the_lens_cannot_make_is_told_in_the_pixels_along_the_known_dimension(folder, capsys):
+def test_aim_warns_of_a_size_that_the_lens_cannot_show(folder, capsys):
     """Of a person along v, whose focal length is another; thousands without an exponent; and what is as wanted, not."""
 
     def told(depth, target):
@@ -151,7 +151,7 @@ def test_aim_takes_a_focal_length(folder, capsys, focal_mm):
 
 
 @pytest.mark.parametrize("method", ["paper-table", "paper-example"])
-def test_the_papers_inverse_can_be_chosen(folder, capsys, method):
+def test_aim_takes_the_papers_inverse_kinematics(folder, capsys, method):
     """Its readings differ from the exact one by less than a degree near the axis; the prediction is of the exact."""
     exact, found = (aim_json(capsys, "--depth", "10", "--ik", each)[0] for each in ("exact", method))
     apart = math.hypot(found["pan_deg"] - exact["pan_deg"], found["tilt_deg"] - exact["tilt_deg"])
@@ -159,7 +159,7 @@ def test_the_papers_inverse_can_be_chosen(folder, capsys, method):
     assert found["predicted_error_deg"] is found["predicted_error_px"] is None
 
 
-def test_photos_are_calibrated(folder, capsys):
+def test_calibrate_takes_photos_of_a_chessboard(folder, capsys):
     """Boards drawn by a homography: the intrinsics come back, and JSON tells the residuals."""
     truth, board = Truth(), BoardConfig(square=0.1)
     rng = np.random.default_rng(0)
@@ -184,7 +184,7 @@ def test_photos_are_calibrated(folder, capsys):
     assert alone in saved["residuals"]["rejected"]
 
 
-def test_photos_of_a_board_with_markers_are_calibrated(folder, capsys):
+def test_calibrate_takes_photos_of_a_charuco_board(folder, capsys):
     """8x6 corners, which no plain chessboard may have, seen by two cameras without any distortion."""
     truth, rng, square_px = Truth(), np.random.default_rng(0), 40
     picture = draw_board(BoardConfig("charuco", (8, 6), 0.1), square_px)
@@ -236,7 +236,7 @@ def zooming(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_who_insists_is_heard_at_every_focal_length(folder, capsys, zooming):
+def test_calibrate_with_insist_accepts_pan_alone_at_every_focal_length(folder, capsys, zooming):
     """With pan alone the first fit, of the shortest focal length, is refused already."""
     directory, rows = zooming
     write_index(directory, [row for row in rows if row["tilt"] == 0])
@@ -247,7 +247,7 @@ def test_who_insists_is_heard_at_every_focal_length(folder, capsys, zooming):
 
 
 @pytest.mark.slow
-def test_the_sequential_method_leaves_other_focal_lengths_alone(folder, capsys, zooming, monkeypatch):
+def test_sequential_method_rejects_images_at_other_focal_lengths(folder, capsys, zooming, monkeypatch):
     def never(*_):
         raise AssertionError("the joint method was asked")
 
@@ -292,7 +292,7 @@ def test_detect_writes_a_table(folder, capsys):
     assert not (folder / "-").exists()
 
 
-def test_ctrl_c_is_no_traceback(folder, capsys, monkeypatch):
+def test_ctrl_c_ends_without_a_traceback(folder, capsys, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 

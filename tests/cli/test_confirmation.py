@@ -45,7 +45,7 @@ def follow(folder, capsys, calibration, *more, rig=RIG, seconds=SECONDS):
 
 
 @pytest.mark.render
-def test_a_target_in_both_views_is_followed(tmp_path, capsys, true):
+def test_target_in_both_views_is_followed(tmp_path, capsys, true):
     status, out, err = follow(tmp_path, capsys, true, seconds=SHORT_S)
     assert (status, err) == (0, "")
     states = json.loads(out)["states"]
@@ -57,7 +57,7 @@ def test_a_target_in_both_views_is_followed(tmp_path, capsys, true):
 @pytest.mark.parametrize(
     "wrong", ["size", *(pytest.param(each, marks=pytest.mark.slow) for each in ("millimetres", "another rig"))]
 )
-def test_a_target_that_the_close_up_never_shows_is_unconfirmed(tmp_path, capsys, true, wrong):
+def test_target_missing_in_the_close_up_is_unconfirmed(tmp_path, capsys, true, wrong):
     calibration = {
         "millimetres": with_zoom_head(true, T_zoom0_fixed=millimetres(true.zoom_head.T_zoom0_fixed)),
         "another rig": with_zoom_head(true, T_zoom0_fixed=pose([0.3, 0.1, 0.1], [-2, 2, 1])),
@@ -79,7 +79,7 @@ BEYOND = {
 
 
 @pytest.mark.parametrize("named", BEYOND)
-def test_what_no_target_is_and_no_lens_shows_is_refused(tmp_path, capsys, true, named):
+def test_follow_refuses_an_implausible_target(tmp_path, capsys, true, named):
     status, out, err = follow(tmp_path, capsys, true, rig=RIG + BEYOND[named])
     assert (status, out) == (1, "")
     [line] = err.splitlines()

@@ -70,9 +70,7 @@ LIMIT = ("--seconds", "20")
     (SystemExit(143), (), 143, f"cotarget follow: terminated{EARLY}"),
     (DeviceError("the camera is gone"), (), 1, f"cotarget follow: the camera is gone{EARLY}"),
 ])  # fmt: skip
-def test_follow_keeps_what_was_seen_until_it_ended_and_halts_the_head_first(
-    folder, capsys, monkeypatch, error, more, status, said
-):
+def test_follow_halts_the_head_then_keeps_the_steps_so_far(folder, capsys, monkeypatch, error, more, status, said):
     error.__dict__.pop("__notes__", None)
     rig = WatchedRig(folder, {("fixed.read", FRAMES + 1): error})
     monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig))
@@ -87,7 +85,7 @@ def test_follow_keeps_what_was_seen_until_it_ended_and_halts_the_head_first(
     assert not [path for path in folder.iterdir() if ".part" in path.name]
 
 
-def test_ctrl_c_ends_a_recorded_run_that_can_be_replayed(folder, capsys, monkeypatch):
+def test_recording_ended_by_ctrl_c_is_replayed(folder, capsys, monkeypatch):
     monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig({("fixed.read", 2 * FRAMES): KeyboardInterrupt()}))
     assert call(capsys, *FOLLOW, "--record", "run")[0] == 0
     status, out, err = call(capsys, "replay", "run", "--check")
@@ -96,7 +94,7 @@ def test_ctrl_c_ends_a_recorded_run_that_can_be_replayed(folder, capsys, monkeyp
 
 
 @pytest.mark.parametrize("failing", ["head.move", "fixed.read"])
-def test_the_recording_of_an_accident_is_replayed_to_its_end(folder, capsys, caplog, monkeypatch, failing):
+def test_recording_of_a_failed_device_is_replayed_to_its_end(folder, capsys, caplog, monkeypatch, failing):
     """The head of the recorded run was lost, so its halts failed too; the replay has no head that could go on."""
     lost = DeviceError("the line is lost")
     accident = {(failing, FRAMES): lost} | {("head.halt", number): lost for number in range(1, 50)}
@@ -110,7 +108,7 @@ def test_the_recording_of_an_accident_is_replayed_to_its_end(folder, capsys, cap
     assert not caplog.records
 
 
-def test_ctrl_c_does_not_hide_a_head_that_cannot_be_halted(folder, capsys, monkeypatch):
+def test_failed_halt_is_reported_after_ctrl_c(folder, capsys, monkeypatch):
     failing = {("fixed.read", FRAMES): KeyboardInterrupt()}
     failing |= {("head.halt", number): DeviceError("the head is gone") for number in range(1, 50)}
     monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig(failing))
@@ -119,7 +117,7 @@ def test_ctrl_c_does_not_hide_a_head_that_cannot_be_halted(folder, capsys, monke
     assert "the head is gone" in err
 
 
-def test_an_emergency_stop_keeps_what_was_seen(folder, capsys, monkeypatch):
+def test_follow_keeps_the_steps_before_an_emergency_stop(folder, capsys, monkeypatch):
     class Stopped(ToyDevices):
         def count(self, what):
             super().count(what)
@@ -134,14 +132,14 @@ def test_an_emergency_stop_keeps_what_was_seen(folder, capsys, monkeypatch):
     assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") > 0
 
 
-def test_a_run_that_ends_before_its_first_step_leaves_the_old_table(folder, capsys, monkeypatch):
+def test_run_without_a_step_keeps_the_old_table(folder, capsys, monkeypatch):
     monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig({("fixed.read", 1): DeviceError("gone")}))
     assert refused(capsys, *FOLLOW) == "cotarget follow: gone"
     assert (folder / "out.csv").read_text() == OLD
     assert not (folder / "out.mp4").exists()
 
 
-def test_a_replay_keeps_what_was_seen(folder, capsys, monkeypatch):
+def test_interrupted_replay_keeps_the_steps_so_far(folder, capsys, monkeypatch):
     def interrupted(*args, **options):
         for number, each in enumerate(follow(*args, **options)):
             if number == FRAMES:
@@ -155,7 +153,7 @@ def test_a_replay_keeps_what_was_seen(folder, capsys, monkeypatch):
     assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
 
 
-def test_detect_keeps_what_was_found(folder, capsys, monkeypatch):
+def test_interrupted_detect_keeps_the_tracks_so_far(folder, capsys, monkeypatch):
     with FilmWriter(folder / "film.mp4", 25.0) as film:
         for index in range(2 * FRAMES):
             film.write(ToyDevices().fixed.expose(index), index / 25)
@@ -175,7 +173,7 @@ def test_detect_keeps_what_was_found(folder, capsys, monkeypatch):
     assert 0 < rows_of(folder / "out.csv") <= FRAMES
 
 
-def test_what_went_wrong_is_told_at_the_end_and_in_json(folder, capsys, monkeypatch):
+def test_follow_reports_why_a_target_was_not_followed(folder, capsys, monkeypatch):
     """A head that may hardly turn: the bird, 10 to 15 degrees off the axis, is beyond its limits and never followed."""
     with (folder / "rig.toml").open("a") as file:
         file.write("pan_deg = [-1, 1]\n")
@@ -198,7 +196,7 @@ def test_what_went_wrong_is_told_at_the_end_and_in_json(folder, capsys, monkeypa
     ({State.FOLLOWING: 4, State.UNCONFIRMED: 5}, 3),  # 4 wrong matches confirm nothing
     ({State.FOLLOWING: 5, State.UNCONFIRMED: 5}, 0),
 ])  # fmt: skip
-def test_the_exit_status_tells_whether_a_target_was_followed_and_confirmed(states, status):
+def test_exit_status_depends_on_followed_and_confirmed_steps(states, status):
     counts, plain = StepCounts(), step(0.0)
     for state, count in states.items():
         for _ in range(count):
@@ -229,9 +227,7 @@ class SlowDevices(ToyDevices):
 
 
 @pytest.mark.parametrize("backend", ["sim", "hardware"])
-def test_frames_that_were_skipped_are_counted_and_leave_their_time_in_table_and_film(
-    folder, capsys, monkeypatch, backend
-):
+def test_skipped_frames_are_counted_and_keep_their_time_in_table_and_film(folder, capsys, monkeypatch, backend):
     if backend == "hardware":
         (folder / "rig.toml").write_text(HARDWARE)
     monkeypatch.setitem(OPENERS, backend, lambda config: rig_of(SlowDevices()))
@@ -280,7 +276,7 @@ def reasons_of(*runs):
     [(50, "", True), (FEW - 1, "both views make it 0.1 m", True)],
     [(1000, "", True), (40, "both views make it 0.1 m", True)],
 ])  # fmt: skip
-def test_what_is_usual_is_no_warning(runs):
+def test_usual_reasons_cause_no_warning(runs):
     assert reasons_of(*runs).warning == ""
 
 
@@ -290,11 +286,11 @@ def test_what_is_usual_is_no_warning(runs):
     ([(10, "", True), (40, "out of sight for 2 s", True)], "40 of 50 frames: out of sight for 2 s"),
     ([(10, "says\n1 thing", True)], "10 of 10 frames: says 1 thing"),
 ])  # fmt: skip
-def test_what_is_wrong_for_many_frames_is_told_most_frequent_first(runs, said):
+def test_frequent_reasons_are_reported_in_order(runs, said):
     assert reasons_of(*runs).warning == said
 
 
-def test_the_table_counts_every_frame_and_numbers_make_no_other_reason():
+def test_reasons_are_counted_without_their_numbers():
     both, one = "needs pan -4.20, tilt 1.06 or pan 173.18, tilt -1.5e-05 degrees", "needs pan 3, tilt 10.6 degrees"
     table = reasons_of((2, "a 1; zoom: unsure", True), (3, "a 2", True), (1, both, True), (2, one, True)).table
     assert table == {"a #": 5, "needs pan #, tilt # degrees": 3, "zoom: unsure": 2}
@@ -307,7 +303,7 @@ def test_the_table_counts_every_frame_and_numbers_make_no_other_reason():
     (False, 100.0, MANY, None),
     (True, 45.0, MANY, None),
 ])  # fmt: skip
-def test_a_wanted_size_that_the_lens_does_not_make_is_told(limited, range_m, steps, shown_px):
+def test_lens_at_its_end_is_reported(limited, range_m, steps, shown_px):
     lens, plain = LensAtItsEnd("bird", DEFAULT_TARGETS["bird"]), step(0.0)
     aim = replace(plain.aim, focal_px=8000.0, range=range_m, limited=limited)
     for _ in range(steps):

@@ -97,7 +97,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("command", "name"), REFUSED, ids=lambda value: value if isinstance(value, str) else value[-1])
-def test_what_is_read_is_not_written(folder, capsys, command, name):
+def test_output_that_is_an_input_is_refused(folder, capsys, command, name):
     line = refused(capsys, *command, name)
     assert line.startswith(f"cotarget {command[0]}: {name}")
     assert "is read or written" in line
@@ -111,13 +111,13 @@ def test_what_is_read_is_not_written(folder, capsys, command, name):
         ("aim", "--calibration", "rig_calibration.json", "--pixel", "9", "9", "--depth", "9"),
     ],
 )
-def test_a_recording_is_no_rig_to_be_driven(folder, capsys, command):
+def test_recording_is_refused_by_commands_that_move_a_rig(folder, capsys, command):
     line = refused(capsys, *command, "--rig", "replay.toml")
     assert line.startswith(f"cotarget {command[0]}: replay.toml: backend is 'replay'; ")
 
 
 @pytest.mark.parametrize("name", ["loop", "pipe", "/dev/null", "run"])
-def test_what_is_no_file_is_not_replaced(folder, capsys, name):
+def test_output_that_is_no_file_is_refused(folder, capsys, name):
     if name == "pipe":
         os.mkfifo(folder / "pipe")
     try:
@@ -128,7 +128,7 @@ def test_what_is_no_file_is_not_replaced(folder, capsys, name):
         (folder / "pipe").unlink(missing_ok=True)
 
 
-def test_where_the_result_is_printed_no_other_is_written(folder, capsys, tmp_path):
+def test_output_that_is_stdout_or_stderr_is_refused(folder, capsys, tmp_path):
     """As with `--csv /dev/stdout > file`."""
     with (tmp_path / "said").open("w") as file:
         for stream in (1, 2):
@@ -143,7 +143,7 @@ def test_where_the_result_is_printed_no_other_is_written(folder, capsys, tmp_pat
             assert "is this command's own stdout or stderr" in err
 
 
-def test_a_link_to_a_result_is_written_through(folder, capsys, tmp_path):
+def test_output_that_is_a_link_is_written_at_its_target(folder, capsys, tmp_path):
     goal, link = tmp_path / "goal.csv", tmp_path / "link.csv"
     goal.write_text(OLD)
     link.symlink_to(goal)
@@ -153,7 +153,7 @@ def test_a_link_to_a_result_is_written_through(folder, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["calibration.json", "calib", "left.txt"])
-def test_a_calibration_may_lie_beside_the_captures_it_is_from(folder, capsys, tmp_path, name):
+def test_calibration_may_be_written_beside_its_photos(folder, capsys, tmp_path, name):
     """There is one already, which is what is to be replaced; what is wrong here are the photos."""
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -169,7 +169,7 @@ def test_a_calibration_may_lie_beside_the_captures_it_is_from(folder, capsys, tm
 
 
 @pytest.mark.parametrize("name", ["left1.png", "calib"])
-def test_a_calibration_takes_the_place_of_no_photo_and_of_nothing_in_an_index(folder, capsys, tmp_path, name):
+def test_calibration_never_replaces_a_captured_image(folder, capsys, tmp_path, name):
     """Of captures with an index, what it lists is read."""
     cv2.imwrite(str(tmp_path / "left1.png"), board_photo())
     write_index(tmp_path, [capture("left1.png")])
@@ -179,7 +179,7 @@ def test_a_calibration_takes_the_place_of_no_photo_and_of_nothing_in_an_index(fo
     assert (tmp_path / "calib").read_text() == OLD
 
 
-def test_a_calibration_that_could_not_be_written_is_told_before_the_session(folder, capsys, tmp_path, monkeypatch):
+def test_unwritable_calibration_is_refused_before_the_session(folder, capsys, tmp_path, monkeypatch):
     monkeypatch.setitem(OPENERS, "sim", lambda config: pytest.fail("opened"))
     out = tmp_path / "c.json"
     writing = PartFile(out)

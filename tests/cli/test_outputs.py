@@ -38,7 +38,7 @@ def names(folder):
 
 
 @pytest.mark.parametrize("linked", [False, True])
-def test_results_of_before_are_kept_beside_the_new_one(folder, capsys, linked):
+def test_previous_results_are_kept_beside_the_new_one(folder, capsys, linked):
     """Beside the goal of a link, which stays one."""
     path = goal = folder / "c.json"
     if linked:
@@ -54,7 +54,7 @@ def test_results_of_before_are_kept_beside_the_new_one(folder, capsys, linked):
     assert [line.split()[-1] for line in lines] == [str(folder / name) for name in kept if name != "c.json"]
 
 
-def test_a_result_that_fails_leaves_no_second_name_behind(folder, capsys):
+def test_failed_result_leaves_no_second_name(folder, capsys):
     path = folder / "c.json"
     path.write_text(OLD)
     with pytest.raises(CalibrationError), previous_kept(path):
@@ -64,7 +64,7 @@ def test_a_result_that_fails_leaves_no_second_name_behind(folder, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_a_file_system_without_links_keeps_a_copy(folder, monkeypatch):
+def test_previous_result_is_copied_where_links_fail(folder, monkeypatch):
     def refuse(*_):
         raise PermissionError(1, "Operation not permitted")
 
@@ -108,7 +108,7 @@ CALIBRATE = ("calibrate", "--rig", "rig.toml", "--captures", "kept")
     (DeviceError("the camera is gone"), 1), (CalibrationError("the motions leave T open"), 1),
     (KeyboardInterrupt(), 130), (SystemExit(143), 143),
 ])  # fmt: skip
-def test_a_session_that_ends_early_says_how_to_go_on(capsys, sessions, error, status):
+def test_interrupted_session_names_the_command_that_continues(capsys, sessions, error, status):
     sessions(error)
     ended, out, err = call(capsys, *CALIBRATE)
     assert (ended, out) == (status, "")
@@ -116,7 +116,7 @@ def test_a_session_that_ends_early_says_how_to_go_on(capsys, sessions, error, st
     assert str(error) in err or status == 143
 
 
-def test_captures_of_another_session_are_not_taken_for_its_own(folder, capsys, sessions):
+def test_refused_session_does_not_offer_earlier_captures(folder, capsys, sessions):
     (folder / "kept").mkdir()
     (folder / "kept" / "index.json").write_text("{}")
     sessions(CalibrationError("kept: already holds captures; give another folder"))
@@ -127,9 +127,7 @@ def test_captures_of_another_session_are_not_taken_for_its_own(folder, capsys, s
     (None, 8, None), (1, 1, None), (2, 4, "2 zoom samples are 12 times apart"),
     (3, 4, "3 zoom samples are 3.5 times apart"), (4, 4, None), (9, 9, None),
 ])  # fmt: skip
-def test_stops_that_are_too_far_apart_have_others_between_them(
-    capsys, caplog, monkeypatch, sessions, stops, taken, said
-):
+def test_zoom_samples_too_far_apart_get_others_between_them(capsys, caplog, monkeypatch, sessions, stops, taken, said):
     """Each at most 2.5 times the one before: from 1 to 12 by 2.29 takes three steps."""
     asked = {}
 
@@ -145,11 +143,11 @@ def test_stops_that_are_too_far_apart_have_others_between_them(
 
 @pytest.mark.parametrize("options", [["--placements", "1"], ["--placements", "6", "--stops", "1"]])
 @pytest.mark.usefixtures("sessions")
-def test_a_session_of_fewer_boards_than_it_needs_is_refused(capsys, options):
+def test_too_few_placements_are_refused(capsys, options):
     assert "placements: " in refused(capsys, "calibrate", "--rig", "rig.toml", *options)
 
 
-def test_an_earlier_calibration_is_kept_and_a_terminal_is_told_the_verdict_alone(folder, capsys, sessions, monkeypatch):
+def test_earlier_calibration_is_kept_and_a_terminal_gets_the_verdict(folder, capsys, sessions, monkeypatch):
     sessions()
     (folder / "calibration.json").write_text(OLD)
     status, out, err = call(capsys, "calibrate", "--rig", "rig.toml")
@@ -161,7 +159,7 @@ def test_an_earlier_calibration_is_kept_and_a_terminal_is_told_the_verdict_alone
     assert call(capsys, "calibrate", "--rig", "rig.toml")[1] == "calibration.json: -0.0\n"
 
 
-def test_progress_is_a_line_now_and_then_where_nobody_looks(capsys):
+def test_progress_without_a_terminal_is_an_occasional_line(capsys):
     time = iter([0.0, 29.0, 31.0, 45.0, 62.0])
     with progress_bar(lambda: next(time)) as progress:
         for done in range(4):
@@ -182,7 +180,7 @@ with progress_bar() as progress:
 """
 
 
-def test_progress_is_a_bar_on_a_terminal_beside_the_results():
+def test_progress_on_a_terminal_is_a_bar_beside_the_results():
     ours, terminal = pty.openpty()
     made = subprocess.run([sys.executable, "-c", SHOWING], stdout=subprocess.PIPE, stderr=terminal, check=True)
     os.close(terminal)
@@ -202,7 +200,7 @@ def _read(terminal):
         return b""
 
 
-def test_zeros_have_no_sign(capsys):
+def test_json_has_no_negative_zeros(capsys):
     print_json({"a": -0.0, "b": [-0.0, {"c": np.float64(-0.0)}], "d": -1.5, "e": None, "f": "-0.0", "g": True})
     assert json.loads(capsys.readouterr().out) == {
         "a": 0.0, "b": [0.0, {"c": 0.0}], "d": -1.5, "e": None, "f": "-0.0", "g": True,
@@ -235,14 +233,14 @@ def pointed(folder, monkeypatch):
     (["--pan-deg", "5", "--tilt-deg", "85", "--focal-mm", "9"], "--tilt-deg: 85", "-46.6 to 31.1"),
     (["--pan-deg", "5", "--focal-mm", "100"], "--focal-mm: 100", "6 to 72"),
 ])  # fmt: skip
-def test_what_is_beyond_the_end_stops_moves_nothing(pointed, capsys, wanted, named, limits):
+def test_point_beyond_the_limits_moves_nothing(pointed, capsys, wanted, named, limits):
     said = refused(capsys, "point", "--rig", "rig.toml", *wanted)
     assert said.startswith(f"cotarget point: {named}")
     assert limits in said
     assert not [what for what, _ in pointed.head.log if what != "halt"]
 
 
-def test_soft_limits_are_limits(pointed, capsys, folder):
+def test_point_keeps_the_soft_limits(pointed, capsys, folder):
     (folder / "rig.toml").write_text("[safety]\npan_deg = [-90, 90]\n")
     assert "-90 to 90" in refused(capsys, "point", "--rig", "rig.toml", "--pan-deg", "91")
     status, out, _ = call(capsys, "point", "--rig", "rig.toml", "--pan-deg", "90")
@@ -250,7 +248,7 @@ def test_soft_limits_are_limits(pointed, capsys, folder):
     assert json.loads(out)["pan_deg"] == pytest.approx(90, abs=math.degrees(pointed.head.limits.step))
 
 
-def test_earlier_pictures_are_kept(pointed, capsys, folder):
+def test_point_keeps_earlier_pictures(pointed, capsys, folder):
     point = ("point", "--rig", "rig.toml", "--pan-deg", "0", "--pictures", ".")
     status, out, err = call(capsys, *point)
     assert (status, err) == (0, "")

@@ -32,7 +32,7 @@ def track(number, center=(1, 1), confirmed=True):
     return Track(number, 0.0, confirmed, 0, center, np.zeros(2), size, 30.0, np.eye(4), 1.0, None)
 
 
-def test_the_names_are_those_of_the_policies():
+def test_policy_names_are_those_of_the_selectors():
     assert set(POLICIES) == set(selectors.POLICIES)
     assert POLICIES[0] == "first-come"
 
@@ -51,7 +51,7 @@ def test_the_names_are_those_of_the_policies():
     ((), {"policy": "nearest-deadline"}, 5),
     (("--track", "3"), {"track": 5}, 3),
 ])  # fmt: skip
-def test_which_target_the_options_and_the_recording_mean(arguments, recorded, number):
+def test_options_or_recording_select_the_target(arguments, recorded, number):
     """Of three: one to the left that stays, one in the middle that leaves in 9 s, one to the right, in 5 s."""
     places = {2: (100, 200), 3: (320, 200), 5: (600, 200)}
     seen_s = (0.0, 2.0, 2.0) if "most-served" in arguments else (0.0, 0.0, 0.0)
@@ -71,7 +71,7 @@ def test_which_target_the_options_and_the_recording_mean(arguments, recorded, nu
     ((), {"click": [3.0, 4.0]}, "the recorded click"),
     ((), None, None),
 ])  # fmt: skip
-def test_what_was_never_there_is_told_with_the_tracks_that_were(arguments, recorded, named):
+def test_unmatched_selection_is_reported_with_the_tracks_seen(arguments, recorded, named):
     selection = chosen(*arguments, recorded=recorded)
     assert selection.warning == ""  # nothing was there at all
     selection.see(SimpleNamespace(target=None, tracks=[track(2), track(3, confirmed=False)]))
@@ -83,14 +83,14 @@ def test_what_was_never_there_is_told_with_the_tracks_that_were(arguments, recor
 
 
 @pytest.mark.parametrize("recorded", [{"click": [640.0, 3.0]}, {"policy": "by-name"}])
-def test_a_recorded_choice_that_cannot_be_is_not_called_an_option(recorded):
+def test_invalid_recorded_selection_is_named_as_recorded(recorded):
     with pytest.raises(ConfigError, match=f"^the recorded {next(iter(recorded))}"):
         chosen(recorded=recorded)
 
 
 @pytest.mark.slow
 @pytest.mark.render
-def test_follow_follows_what_was_chosen(tmp_path, capsys):
+def test_follow_passes_the_selection_on(tmp_path, capsys):
     (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
     save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
     command = ("follow", "--rig", tmp_path / "rig.toml", "--calibration", tmp_path / "good.json", "--target", "book")

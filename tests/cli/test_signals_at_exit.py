@@ -138,7 +138,7 @@ def start(tmp_path):
     (signal.SIGHUP, 128 + signal.SIGHUP, 1),  # a terminal that was closed, a connection that broke
     (signal.SIGQUIT, 128 + signal.SIGQUIT, 1),  # Ctrl-\
 ])  # fmt: skip
-def test_a_signal_halts_the_head_and_further_ones_do_not_keep_it_from_that(start, number, status, again):
+def test_signal_halts_the_head_despite_further_signals(start, number, status, again):
     child = start(PROGRAM + WORK)
     child.wait_for("working")
     child.signal(number)
@@ -166,7 +166,7 @@ def test_ctrl_z_halts_the_head_before_it_suspends_the_program(start, number):
     assert returned == 128 + signal.SIGTERM
 
 
-def test_a_program_whose_head_cannot_be_halted_is_not_suspended(start):
+def test_program_is_not_suspended_while_its_head_cannot_be_halted(start):
     """Its watchdog goes on trying."""
     broken = (
         "tries = []\ndef halt():\n    tries.append(1)\n    say('tried')\n    if len(tries) < 3: raise OSError('dead')\n"
@@ -183,7 +183,7 @@ def test_a_program_whose_head_cannot_be_halted_is_not_suspended(start):
     assert returned == 128 + signal.SIGTERM
 
 
-def test_a_signal_while_a_good_end_halts_the_head_acts_afterwards(start):
+def test_signal_during_the_final_halt_acts_afterwards(start):
     child = start(PROGRAM + "with guarded(rig, SafetyConfig()):\n    pass\nsay('never')")
     child.wait_for("halting")
     child.signal(signal.SIGTERM)
@@ -192,7 +192,7 @@ def test_a_signal_while_a_good_end_halts_the_head_acts_afterwards(start):
     assert returned in (128 + signal.SIGTERM, -signal.SIGTERM)
 
 
-def test_devices_that_do_not_let_go_do_not_hold_the_program_for_ever(start):
+def test_hanging_device_does_not_prevent_ctrl_c(start):
     """Once the head is halted, enough of Ctrl-C ends the wait for a device that hangs."""
     child = start(PROGRAM + "rig.close = lambda: (say('closing'), time.sleep(1000))" + WORK)
     child.wait_for("working")
@@ -210,13 +210,13 @@ def test_devices_that_do_not_let_go_do_not_hold_the_program_for_ever(start):
     assert returned == -signal.SIGINT
 
 
-def test_a_rig_that_nobody_closes_is_halted_at_the_end(start):
+def test_unclosed_rig_is_halted_at_exit(start):
     child = start(PROGRAM + "safe = guarded(rig, SafetyConfig(watchdog_s=1000.0))\nsafe.head.move(0.5, 0.0)")
     returned, lines, err = child.finish()
     assert (returned, lines, err) == (0, ["halting", "halted", "closed"], "")
 
 
-def test_a_program_that_sets_its_own_handlers_keeps_them(start):
+def test_program_keeps_its_own_signal_handlers(start):
     own = "import signal\nsignal.signal(signal.SIGTERM, lambda *_: say('mine'))\n"
     child = start(PROGRAM + own + WORK.replace("sleep(1000)", "sleep(0)"))
     child.wait_for("halting")
@@ -231,7 +231,7 @@ def test_a_program_that_sets_its_own_handlers_keeps_them(start):
     pytest.param(signal.SIGTERM, 143, "terminated", marks=pytest.mark.slow),
     pytest.param(signal.SIGHUP, 129, "terminated", marks=pytest.mark.slow),
 ])  # fmt: skip
-def test_following_is_ended_by_a_signal_with_the_head_halted(start, tmp_path, number, status, said):
+def test_follow_ended_by_a_signal_halts_the_head(start, tmp_path, number, status, said):
     """A second signal comes while the head is being halted; only then is the table completed, with what there is."""
     (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
     save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))

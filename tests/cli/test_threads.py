@@ -18,7 +18,7 @@ print(*{pool["num_threads"] for pool in threadpool_info()})
 
 
 @pytest.mark.parametrize(("environment", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
-def test_a_command_uses_one_thread_of_linear_algebra(environment, threads, tmp_path):
+def test_command_uses_one_thread_of_linear_algebra(environment, threads, tmp_path):
     if len(os.sched_getaffinity(0)) < 2:
         pytest.skip("with one core there is never a second thread")
     clean = {name: value for name, value in os.environ.items() if name not in LINEAR_ALGEBRA}

@@ -53,7 +53,7 @@ def test_a_frustum_ends_at_the_corners_of_the_image(world, camera, t, depth):
     np.testing.assert_allclose(independent[:, 0], border, atol=NEAR_PX)
 
 
-def test_the_zoom_cameras_frustum_follows_head_and_lens_and_the_wide_ones_does_not(world):
+def test_zoom_frustum_follows_head_and_lens(world):
     before, after = (frusta_of(world.truth(), t, {"zoom": 10.0}) for t in (0.0, 5.0))
     np.testing.assert_array_equal(before["fixed"], after["fixed"])
 
@@ -80,7 +80,7 @@ def test_lines_are_drawn_from_end_to_end(world):
         np.testing.assert_allclose(geom.pos + along, end, atol=NEAR_M)
 
 
-def test_an_onlookers_state_is_the_worlds_and_stays_when_the_world_moves_on(world):
+def test_copy_of_the_world_keeps_its_state(world):
     shown, truth = WorldCopy(world.truth()), world.truth()
     shown.move_to(5.0)
     mujoco.mj_kinematics(shown.model, shown.data)
@@ -122,7 +122,7 @@ def moments(clock, took):
         yield Snapshot(index * 0.1, "", {}, {})
 
 
-def test_nothing_happens_quicker_than_it_does_and_a_slow_moment_is_not_made_up_for():
+def test_snapshots_are_shown_in_real_time_without_catching_up():
     clock = People()
     window = Window(clock)
     running.watch(moments(clock, [0.0, 0.02, 0.02, 0.5, 0.02]), window, clock.now, clock.sleep)
@@ -130,7 +130,7 @@ def test_nothing_happens_quicker_than_it_does_and_a_slow_moment_is_not_made_up_f
     np.testing.assert_allclose(clock.now(), 0.8)
 
 
-def test_it_ends_when_the_window_is_closed():
+def test_watching_ends_when_the_window_is_closed():
     clock = People()
     window = Window(clock, closed_after=2)
     running.watch(moments(clock, [0.0] * 9), window, clock.now, clock.sleep)
@@ -138,7 +138,7 @@ def test_it_ends_when_the_window_is_closed():
 
 
 @pytest.mark.parametrize("target", [(), ("--target", "book")])
-def test_the_command_shows_the_rig_at_rest_or_the_pipeline_at_work(tmp_path, capsys, monkeypatch, target):
+def test_view_shows_the_rig_at_rest_or_the_pipeline(tmp_path, capsys, monkeypatch, target):
     clock, shown = People(), []
     (tmp_path / "rig.toml").write_text('[sim]\ntargets = ["book"]\n')
 
@@ -181,7 +181,7 @@ def unserved(monkeypatch):
 
 
 @pytest.mark.parametrize(("fails", "said"), [(None, "within 0 s"), (OSError("no more threads"), "no more threads")])
-def test_a_page_that_does_not_come_up_leaves_nothing_behind(world, monkeypatch, unserved, fails, said):
+def test_failed_page_releases_viewer_and_port(world, monkeypatch, unserved, fails, said):
     serves, closed = unserved
 
     def refuse(*_):
@@ -198,7 +198,7 @@ def test_a_page_that_does_not_come_up_leaves_nothing_behind(world, monkeypatch, 
 
 
 @pytest.mark.parametrize("window", [(1200, 900), (333, 777), (90, 70)])
-def test_pictures_in_a_window_are_as_large_as_their_places_and_one_above_the_other(window):
+def test_window_pictures_fill_their_places_one_above_the_other(window):
     """MuJoCo draws as many pixels as the place has, whatever the picture's own size."""
     blue, red = np.zeros((480, 640, 3), np.uint8), np.zeros((200, 320, 3), np.uint8)
     blue[..., 0] = red[..., 2] = 255
@@ -217,7 +217,7 @@ def test_pictures_in_a_window_are_as_large_as_their_places_and_one_above_the_oth
 
 
 @pytest.mark.wire
-def test_the_page_is_served_to_this_machine_alone_with_the_model_and_ends_with_the_window(world):
+def test_page_is_served_to_this_machine_until_the_window_closes(world):
     from mujoco.studio.web import state_payload
 
     listener = browser.listen(0)
@@ -242,7 +242,7 @@ def test_the_page_is_served_to_this_machine_alone_with_the_model_and_ends_with_t
         urllib.request.urlopen(where, timeout=ANSWER_S)
 
 
-def test_the_overlay_hands_over_lines_and_pictures_that_are_new(world):
+def test_overlay_uploads_only_new_pictures(world):
     sent = []
 
     def upload(texture, pixels, width, height, bytes_a_pixel):

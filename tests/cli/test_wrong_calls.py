@@ -34,16 +34,13 @@ FILES = {
     "other_shape.toml": "[sim.fixed]\nsize = [640, 360]\n",
     "typo.toml": "[sim]\nscenery = 1\n",
     "moon.toml": '[sim]\nscene = "moon"\n',
-    "whale.toml": '[sim]\ntargets = ["whale"]\n',
     "broken.toml": "[sim\n",
     "unstoppable.toml": "[safety]\nstop_file = 5\n",
     "nameless.toml": 'backend = "hardware"\n[board]\nsquare = 0.1\n',
-    "number.toml": 'backend = "hardware"\n[hardware.head]\nport = 5\n',
     "hw.toml": HARDWARE,
     "replay.toml": 'backend = "replay"\nrecording = "none"\n',
     "of_nothing.toml": 'backend = "replay"\n',
     "broken.json": '{"schema": 2, "fixed": {',
-    "empty.json": '{"schema": 2}',
     "list.json": "[1, 2]",
     "text.mp4": "no film",
     "other.csv": "a,b\n1,2\n",
@@ -65,7 +62,6 @@ CALLS = [
     ("", USAGE, "COMMAND"),
     ("dance", USAGE, "'dance'", "calibrate"),
     ("demo --seed 1.5", USAGE, "--seed", "'1.5'"),
-    ("demo --seed -1", USAGE, "--seed", "'-1'"),
     ("demo --seed ²", USAGE, "--seed"),
     ("demo --out film.mp4", FAILED, "film.mp4"),
     ("demo --out out.json/x", FAILED, "out.json/x"),
@@ -73,14 +69,10 @@ CALLS = [
     ("calibrate", USAGE, "--rig", "--from"),
     ("calibrate --rig folder", FAILED, "folder"),
     ("calibrate --rig moon.toml", FAILED, "moon.toml: ", "'moon'", "indoor, outdoor"),
-    ("calibrate --rig whale.toml", FAILED, "whale.toml: sim.targets", "'whale'", "bird, book, person"),
-    ("calibrate --rig number.toml", FAILED, "number.toml: hardware.head.port"),
     ("calibrate --rig nameless.toml", FAILED, "nameless.toml: hardware.head.port"),
     ("calibrate --rig rig.toml --placements 0", USAGE, "--placements", "'0'"),
-    ("calibrate --rig rig.toml --stops x", USAGE, "--stops", "'x'"),
     ("calibrate --rig rig.toml --out -", FAILED, "-: "),
     ("calibrate --rig rig.toml --out rig.toml", FAILED, "rig.toml: "),
-    ("calibrate --rig rig.toml --out none/c.json", FAILED, "none/c.json"),
     ("calibrate --rig rig.toml --out folder", FAILED, "folder: "),
     ("calibrate --rig rig.toml --board 9x6", FAILED, "--board", "--from"),
     ("calibrate --rig rig.toml --kind charuco", FAILED, "--kind", "--from"),
@@ -90,7 +82,6 @@ CALLS = [
     (f"{OUT} --from folder {PHOTOS}", FAILED, "folder: ", "'left*.png'"),
     (f"{OUT} --from none {PHOTOS}", FAILED, "none: "),
     (f"{OUT} --from folder", FAILED, "folder: ", "index.json"),
-    (f"{OUT} --from none", FAILED, "none: ", "--from"),
     (f"{OUT} --from film.mp4", FAILED, "film.mp4: "),
     (f"{OUT} --from index", FAILED, "index/index.json: ", "board"),
     (f"{OUT} --from cut", FAILED, "cut/index.json: "),
@@ -111,11 +102,9 @@ CALLS = [
     (f"{OUT} --from single {PHOTOS} --encoders", FAILED, "--encoders", "--rig"),
     # report and board
     ("report", USAGE, "FILE"),
-    ("report none.json", FAILED, "none.json"),
     ("report list.json", FAILED, "list.json"),
     ("report film.mp4", FAILED, "film.mp4", "UTF-8"),
     ("report millimetres.json --out page.html", FAILED, POSE, "metres", "--insist"),
-    ("report good.json --out folder", FAILED, "folder: "),
     ("report good.json --out film.mp4/page.html", FAILED, "film.mp4/page.html: film.mp4"),
     ("board", USAGE, "--out"),
     ("board --out new.txt", FAILED, "new.txt", ".pdf, .png, .svg"),
@@ -127,7 +116,6 @@ CALLS = [
     (f"{AIM} --depth 5 --size-px 16", USAGE, "--size-px", "--depth"),
     (f"{AIM} --depth -3", USAGE, "--depth", "-3"),
     (f"{AIM} --depth nan", USAGE, "--depth", "nan"),
-    (f"{AIM} --depth far", USAGE, "--depth", "'far'"),
     (f"{AIM} --depth 1e300", FAILED, "1e+300"),
     (f"{AIM} --depth 5 --fast", USAGE, "--fast"),
     (f"{AIM} --depth 5 --ik magic", USAGE, "--ik", "magic", "exact", "paper-table"),
@@ -145,9 +133,6 @@ CALLS = [
     (f"{AIM} --size-px 1e-320 --target book", FAILED, "--size-px"),
     ("aim --calibration good.json --pixel 640 240 --depth 5", FAILED, "--pixel", "(640, 240)", "640x480"),
     ("aim --calibration good.json --pixel nan 240 --depth 5", FAILED, "--pixel", "(nan, 240)"),
-    ("aim --calibration good.json --pixel a b --depth 5", USAGE, "--pixel", "'a'"),
-    ("aim --calibration good.json --pixel 5 --depth 5", USAGE, "--pixel"),
-    ("aim --calibration none.json --pixel 3 4 --depth 5", FAILED, "none.json"),
     ("aim --calibration broken.json --pixel 3 4 --depth 5", FAILED, "broken.json"),
     ("aim --calibration headless.json --pixel 3 4 --depth 5", FAILED, "T_head_zoom"),
     ("aim --calibration millimetres.json --pixel 3 4 --depth 5", FAILED, POSE, "metres", "--insist"),
@@ -158,7 +143,6 @@ CALLS = [
     ("follow --calibration good.json --rig hw.toml --target book", FAILED, "good.json: ", "704x576"),
     ("follow --calibration good.json --rig replay.toml --target book", FAILED, "none: "),
     ("follow --calibration good.json --rig of_nothing.toml --target book", FAILED, "of_nothing.toml: recording"),
-    ("follow --calibration empty.json --rig rig.toml --target book", FAILED, "empty.json"),
     ("follow --calibration wide.json --rig rig.toml --target book", FAILED, "wide.json: ", "640x480", "640x360"),
     ("follow --calibration millimetres.json --rig rig.toml --target book", FAILED, POSE, "metres", "--insist"),
     (f"{FOLLOW} --seconds 0", USAGE, "--seconds"),
@@ -166,18 +150,15 @@ CALLS = [
     (f"{FOLLOW} --click 640 3", FAILED, "--click", "(640, 3)", "640x480"),
     (f"{FOLLOW} --click -1 3", FAILED, "--click", "(-1, 3)"),
     (f"{FOLLOW} --click 3 nan", USAGE, "--click", "nan"),
-    (f"{FOLLOW} --click 3", USAGE, "--click"),
     (f"{FOLLOW} --track 0", USAGE, "--track", "'0'"),
     (f"{FOLLOW} --track 1 --policy first-come", USAGE, "--track", "--policy"),
     (f"{FOLLOW} --csv good.json", FAILED, "good.json: "),
     (f"{FOLLOW} --csv out.csv --video out.csv", FAILED, "out.csv: "),
-    (f"{FOLLOW} --csv none/out.csv", FAILED, "none/out.csv"),
     (f"{FOLLOW} --video none/out.mp4", FAILED, "none/out.mp4"),
     (f"{FOLLOW} --video -", FAILED, "-: "),
     (f"{FOLLOW} --record film.mp4", FAILED, "film.mp4: "),
     ("replay none", FAILED, "none: "),
     ("replay folder", FAILED, "folder: "),
-    ("replay film.mp4", FAILED, "film.mp4: "),
     ("replay film.mp4 --check x", USAGE, "x"),
     # what operates a rig; refused before any device is opened
     ("point --rig rig.toml --pan-deg x", USAGE, "--pan-deg", "'x'"),
@@ -187,13 +168,9 @@ CALLS = [
     ("latency --rig replay.toml", FAILED, "replay.toml: backend"),
     ("latency --rig nameless.toml", FAILED, "hardware.head.port", "/dev/tty"),
     ("latency --rig hw.toml", FAILED, "http://127.0.0.1:9"),
-    ("latency --rig hw.toml --calibration none.json", FAILED, "none.json"),
-    ("latency --rig hw.toml --calibration wide.json", FAILED, "wide.json"),
-    ("latency --rig rig.toml --calibration list.json", FAILED, "list.json"),
     ("latency --rig rig.toml --calibration headless.json", FAILED, "T_head_zoom"),
     ("latency --rig rig.toml --calibration millimetres.json", FAILED, POSE, "metres", "--insist"),
     ("stop", USAGE, "--rig"),
-    ("stop --rig none.toml", FAILED, "none.toml: "),
     ("stop --rig unstoppable.toml", FAILED, "unstoppable.toml: safety.stop_file: 5"),
     ("clear", USAGE, "--rig"),
     ("clear --rig sim.toml", FAILED, "sim.toml: ", "[safety] stop_file"),
@@ -204,14 +181,9 @@ CALLS = [
     ("emulate --rig hw.toml --write new.toml", FAILED, "hw.toml: backend"),
     ("emulate --write new.toml --user root", FAILED, "--user", "COTARGET_PASSWORD"),
     ("emulate --write new.toml --fault silence", FAILED, "--fault", "'silence'", "fixed., head., zoom."),
-    ("emulate --write new.toml --fault a.b", FAILED, "--fault", "'a.b'", "fixed., head., zoom."),
     ("emulate --write new.toml --fault head.rust", FAILED, "--fault", "'head.rust'", "garbage", "silence"),
     ("emulate --write new.toml --head 65536", USAGE, "--head", "'65536'"),
-    ("emulate --write new.toml --seconds 0", USAGE, "--seconds"),
     ("emulate --rig sim.toml --write sim.toml", FAILED, "sim.toml: "),
-    ("emulate --write folder", FAILED, "folder: "),
-    ("emulate --write none/new.toml", FAILED, "none/new.toml: "),
-    ("emulate --write -", FAILED, "-: "),
     # what shows and inspects
     ("view --port 5", FAILED, "--port", "--browser"),
     ("view --calibration good.json", FAILED, "--calibration", "--target"),
@@ -219,16 +191,13 @@ CALLS = [
     ("view --rig hw.toml", FAILED, "hw.toml: backend"),
     ("view --rig rig.toml --target bird", FAILED, "rig.toml: ", '[sim] targets = ["book", "bird"]'),
     ("detect film.mp4", USAGE, "--target", "--csv"),
-    ("detect none.mp4 --target bird --csv new.csv", FAILED, "none.mp4"),
     ("detect text.mp4 --target bird --csv new.csv", FAILED, "text.mp4"),
     ("detect folder --target bird --csv new.csv", FAILED, "folder: "),
     ("detect film.mp4 --target dog --csv new.csv", FAILED, "--target", "'dog'"),
-    (f"{DETECT} new.csv --rig none.toml", FAILED, "none.toml"),
     (f"{DETECT} none/new.csv", FAILED, "none/new.csv"),
     (f"{DETECT} new.csv --labels other.csv", FAILED, "other.csv", "frame, x_px"),
     (f"{DETECT} new.csv --video new.txt", FAILED, "new.txt", ".mp4"),
     (f"{DETECT} - --labels late.csv", FAILED, "--labels", "--csv"),
-    ("doctor --rig none.toml", FAILED, "none.toml"),
     ("doctor --rig typo.toml", FAILED, "typo.toml", "sim.scenery"),
 ]
 # Messages that a newcomer meets first, word for word.
@@ -311,25 +280,20 @@ def check(capsys, line, status, *parts):
 
 
 @pytest.mark.parametrize("call", CALLS, ids=lambda call: call[0])
-def test_a_wrong_call_ends_in_one_line_that_names_it(folder, capsys, call):
+def test_wrong_call_ends_in_one_line(folder, capsys, call):
     check(capsys, *call)
 
 
 @pytest.mark.render
 @pytest.mark.parametrize("call", OPENED, ids=lambda call: call[0])
-def test_a_mistake_that_shows_with_the_rig_open_ends_in_one_line(folder, capsys, call):
+def test_wrong_call_found_with_the_rig_open_ends_in_one_line(folder, capsys, call):
     check(capsys, *call)
 
 
 @pytest.mark.parametrize("line", FIRST)
-def test_what_a_newcomer_meets_first_is_said_in_these_words(folder, capsys, line):
+def test_first_messages_have_this_wording(folder, capsys, line):
     _, _, said = call(capsys, *shlex.split(line))
     assert said == f"{' '.join(['cotarget', *line.split()[:1]])}: {FIRST[line]}\n"
-
-
-def test_an_unknown_key_is_told_with_the_valid_ones(folder, capsys):
-    said = refused(capsys, "point", "--rig", "typo.toml")
-    assert said.startswith("cotarget point: typo.toml: unknown key 'sim.scenery'; valid here: T_head_zoom, ")
 
 
 @pytest.mark.wire
@@ -337,11 +301,11 @@ def test_an_unknown_key_is_told_with_the_valid_ones(folder, capsys):
 @pytest.mark.parametrize(
     "command", [("emulate", "--write", "new.toml", "--seconds", "1", "--control"), ("view", "--browser", "--port")]
 )
-def test_a_port_that_is_taken_is_told(folder, capsys, command):
+def test_port_in_use_is_named(folder, capsys, command):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         assert port in refused(capsys, *command, port)
 
 
-def test_labels_of_another_film_are_an_error(folder, capsys, tmp_path):
+def test_labels_of_another_film_are_refused(folder, capsys, tmp_path):
     assert "late.csv: " in refused(capsys, *shlex.split(DETECT), tmp_path / "tracks.csv", "--labels", "late.csv")

@@ -103,7 +103,7 @@ def test_v010_calibrations_by_other_methods_load():
 
 
 @pytest.mark.parametrize("name", ["calibration", "calibration_photos", "calibration_sequential", "calibration_plain"])
-def test_calibration_json_is_written_as_it_was(name, tmp_path):
+def test_calibration_json_is_written_as_before(name, tmp_path):
     then = read(OLD / f"{name}.json")
     save_calibration(tmp_path / "now.json", load_calibration(OLD / f"{name}.json"))
     now = read(tmp_path / "now.json")
@@ -128,7 +128,7 @@ def test_a_covariance_has_the_listed_parameters(tmp_path):
     )
 
 
-def test_v010_calibration_aims_as_it_did(old, capsys):
+def test_v010_calibration_aims_as_before(old, capsys):
     arguments = ["--pixel", 400, 200, "--depth", 9, "--target", "book", "--wanted-px", 60, "--rig", "rig_captures.toml"]
     now, then = run(capsys, "aim", "--calibration", "calibration.json", *arguments), read(old / "printed" / "aim.json")
     assert_close(now, then, SAME)
@@ -283,7 +283,7 @@ def test_v010_recording_is_replayed(old, capsys):
 
 
 @pytest.mark.parametrize("table", [{}, {"click": [72.0, 78.0]}, {"track": 1}, {"policy": "nearest-deadline"}])
-def test_the_choice_of_a_target_is_read_from_a_recording(table, old, capsys):
+def test_recorded_selection_is_read(table, old, capsys):
     path = old / "recording" / "recording.json"
     path.write_text(json.dumps(read(path) | {"whom": table}))
     assert set(table) <= {key.removeprefix("whom.") for key in listed_keys("recordings.txt", "recording.json ")}
@@ -427,7 +427,7 @@ def plain_log(folder):
     return [{"rig": spec}, *({key: line[key] for key in line if key not in ("bytes", *LATER)} for line in rest)]
 
 
-def test_every_call_is_recorded_as_it_was(tmp_path):
+def test_every_call_is_recorded_as_before(tmp_path):
     assert record_every_call(tmp_path / "now") == ANSWERS
     assert plain_log(tmp_path / "now") == plain_log(OLD / "every_call")
     assert_is_recording(tmp_path / "now", may_lack=["template.png"])
@@ -547,7 +547,7 @@ def test_v010_metrics_are_read():
 
 
 @pytest.mark.parametrize("kind", ["chessboard", "charuco"])
-def test_a_board_is_printed_as_it_was(kind, tmp_path, capsys):
+def test_board_is_printed_as_before(kind, tmp_path, capsys):
     """Boards that were printed are still to be found, so that squares and markers stay where they are."""
     out = tmp_path / "board.png"
     assert main(["board", "--out", str(out), "--kind", kind, "--board", "4x3", "--square", "0.01"]) == 0
@@ -577,7 +577,7 @@ def test_v010_stop_file_stops(tmp_path, capsys, monkeypatch):
     assert Path("rig/stop").read_bytes() == (OLD / "stopped" / "stop").read_bytes()
 
 
-def test_v010_position_lost_file_is_heeded(tmp_path, monkeypatch):
+def test_v010_position_lost_file_is_read(tmp_path, monkeypatch):
     name = "stop.dev-ttyUSB0.position-lost"
     for port in ("/dev/ttyUSB0", "/dev/ttyUSB1"):  # the same unit, at another port maybe
         with pytest.raises(DeviceError, match="hit a limit"):

@@ -292,7 +292,7 @@ def test_the_emulated_devices_have_the_listed_faults(device, tmp_path, capsys):
     assert_listed("emulation.txt", {f"{begins}{name}" for name in names}, begins=begins)
 
 
-def test_a_program_that_holds_the_board_is_asked_in_the_listed_words():
+def test_board_presenter_gets_the_listed_requests():
     said = []
     with socket.create_server(("127.0.0.1", 0)) as server:
 
