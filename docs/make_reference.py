@@ -166,7 +166,8 @@ def command_line() -> str:
         write = parser._get_formatter()._format_action_invocation
         rows = [(f"`{write(a)}`", a.help or "") for a in parser._actions if a.dest not in ("help", "verbose")]
         parts.append(_grid(("argument", "meaning"), rows) if rows else "")
-        parts.append(f"```text\n{parser.more()}\n```\n" if parser.more else "")
+        epilog = parser.make_epilog() if parser.make_epilog else parser.epilog
+        parts.append(f"```text\n{epilog}\n```\n" if epilog else "")
     return "\n".join(parts)
 
 
