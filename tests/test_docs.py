@@ -2,6 +2,7 @@
 
 import pkgutil
 import re
+import runpy
 import sys
 import types
 from pathlib import Path
@@ -52,3 +53,12 @@ def test_the_experiment_that_the_documentation_adds_runs(monkeypatch):
     experiment = experiment_of(module)
     rows = [row for seed in experiment.quick.numbers for row in pictured(experiment.one(experiment.quick, seed)).rows]
     assert experiment.missed(experiment.summarise(rows)) == []
+
+
+def test_reference_lists_options_keys_and_the_end_of_help():
+    made = runpy.run_path(str(ROOT / "docs/make_reference.py"))
+    commands, keys = made["command_line"](), made["configuration"]()
+    assert "| `--placements N` | with --rig: number of board placements" in commands
+    assert "exit status: 0 the target was followed" in commands
+    assert "faults: head.silence" in commands
+    assert "| `watchdog_s` | number | s | `0.35` | > 0.04 and ≤ 60 |" in keys
