@@ -85,7 +85,7 @@ def _assets() -> Finding:
 
 
 def rendering() -> Finding:
-    """Render a picture without a screen, in a process of its own."""
+    """Render a picture without a screen, in a separate process."""
     try:
         tried = subprocess.run(
             [sys.executable, "-c", RENDER], capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False

@@ -50,7 +50,7 @@ def test_offsets_and_targets_are_taken(tmp_path):
     assert config.sim.paths["bird"][1] == (10.0, 5.0, 20.0, 6.0)
 
 
-# Values that a key refuses, each by a line that begins with the key.
+# Values that a key refuses; each message begins with the key.
 REFUSED = {
     "backend": ["'real'"],
     "board.corners": ["'9x6'", "[2, 6]", "[201, 400]", "[8, 6]"],
@@ -91,7 +91,7 @@ REFUSED = {
 
 
 def refusal(path, text):
-    """The one line by which a rig.toml of that text is refused, behind the file's name."""
+    """The line that refuses a rig.toml of a text, without the file's name."""
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
         load_config(path)
@@ -120,7 +120,7 @@ def test_text_that_is_no_toml_is_refused(tmp_path):
 
 
 def test_byte_order_mark_is_accepted(tmp_path):
-    """As Windows' editors put it before a text in UTF-8."""
+    """Some editors on Windows put it before a text in UTF-8."""
     (tmp_path / "rig.toml").write_text('backend = "sim"\n[sim]\nseed = 7\n', encoding="utf-8-sig")
     assert load_config(tmp_path / "rig.toml").sim.seed == 7
 
@@ -151,7 +151,7 @@ def test_zoom_curves_are_checked_only_with_the_optics_effect():
 
 @pytest.mark.parametrize(("size", "by"), [([1280, 960], 2), ([320, 240], 0.5), ([1280, 720], 2)])
 def test_another_image_size_shows_the_same_view(size, by):
-    """As wide a view as before: the pixel at the left border, and the true centre, lie in the same directions."""
+    """The pixel at the left border and the true centre are in the same directions as before."""
     before = parse_config({}).sim
     after = parse_config({"sim": {"fixed": {"size": size}, "zoom": {"size": size}}}).sim
     for old, new in ((before.fixed, after.fixed), (before.zoom, after.zoom)):
@@ -159,7 +159,7 @@ def test_another_image_size_shows_the_same_view(size, by):
         assert (-0.5 - new.center_px[0]) / new.focal_px[0] == pytest.approx((-0.5 - old.center_px[0]) / old.focal_px[0])
         middle = (size[1] - 1) / 2
         assert new.center_px[1] - middle == pytest.approx(by * (old.center_px[1] - 239.5))
-    # The device tells focal lengths in its own pixels, as much off as before; the centre drifts as far on the sensor.
+    # The device reports focal lengths in pixels of its stream, and the centre drifts as far on the sensor.
     assert 6.0 / after.zoom.pitch_mm / after.zoom.focal_px[0] == pytest.approx(6.0 / 0.009 / 692)
     assert after.zoom.center_drift_px[0][0] == pytest.approx(27.0 * by)
 
@@ -182,7 +182,7 @@ def test_given_intrinsics_are_not_scaled_with_the_image_size():
     {"size": [640, 480], "focal_px": [346, 346.5]},
 ])  # fmt: skip
 def test_reported_focal_length_scales_with_the_true_one(said):
-    """However large the picture is: 6 mm are told as by the default rig, and the centre drifts by as large an angle."""
+    """At any image size, 6 mm give the same ratio of reported to true focal length, and the centre drifts as far."""
     plain, zoom = parse_config({}).sim.zoom, parse_config({"sim": {"zoom": said}}).sim.zoom
     assert zoom.focal_px == tuple(map(float, said["focal_px"]))
     by = zoom.focal_px[0] / plain.focal_px[0]

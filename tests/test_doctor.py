@@ -1,4 +1,4 @@
-"""The doctor: what is missing is said with the command that mends it, whatever else is broken."""
+"""The doctor reports what is missing with the command that fixes it."""
 
 import os
 import socket
@@ -20,7 +20,7 @@ from cotarget.emulators.plant import Feed
 
 @pytest.fixture
 def tried(monkeypatch):
-    """The rendering process, replaced: set its outcome."""
+    """The outcome of the replaced rendering process."""
     outcome = SimpleNamespace(returncode=0, stdout="egl\n", stderr="", error=None)
     real = subprocess.run
 
@@ -92,7 +92,7 @@ def test_only_a_real_rig_needs_gphoto2(tried, monkeypatch):
 
 
 def test_zoom_camera_and_board_presenter_are_probed(tried):
-    """Port 1 of this machine is nobody's; a person is always there."""
+    """Nothing listens at port 1 of this machine; a person always answers."""
     pytest.importorskip("gphoto2")
     found = findings(real(zoom={"port": "ptpip:127.0.0.1:1"}))
     assert (found["hardware.zoom"].ok, found["hardware.board"].ok) == (False, True)

@@ -1,4 +1,4 @@
-"""Results: under their name only when complete, written by one run at a time, and through links."""
+"""Files get their name when they are complete, and are written by one run at a time, through links."""
 
 import fcntl
 import re
@@ -54,7 +54,7 @@ def test_partial_result_is_kept_after_an_error_with_a_note(tmp_path, name, write
         write(path, 3, error)
     assert path.read_text() == "old"
     with pytest.raises(type(error)) as caught:
-        write(path, 0, error, keep=True)  # nothing is worth no more than what was there
+        write(path, 0, error, keep=True)  # without a row there is nothing to keep
     assert path.read_text() == "old"
     assert not hasattr(caught.value, "__notes__")
     with pytest.raises(type(error)) as caught:
@@ -154,7 +154,7 @@ def test_second_run_on_the_same_result_is_refused(tmp_path, name, make):
 
 
 def test_small_file_waits_for_another_run(tmp_path):
-    """Each of them is whole afterwards; a run that goes on writing is refused in the end."""
+    """The second file is complete afterwards."""
     path = tmp_path / "a.json"
     first = PartFile(path)
     first.path.write_text("first")
@@ -195,7 +195,7 @@ class Signalled:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_second_signal_while_a_film_is_completed_loses_nothing(tmp_path, monkeypatch, number):
-    """The first has ended the run; what comes while the file is completed says no more."""
+    """The first one has ended the run; the second one is ignored while the file is completed."""
     containers, plain = [], av.open
     monkeypatch.setattr(av, "open", lambda *a, **k: containers.append(Signalled(plain(*a, **k))) or containers[-1])
 
@@ -222,7 +222,7 @@ def test_second_signal_while_a_film_is_completed_loses_nothing(tmp_path, monkeyp
 
 @pytest.fixture
 def _ctrl_c():
-    """Whatever it does to the tests."""
+    """Ctrl-C raises KeyboardInterrupt, as it does outside of pytest."""
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, former)
@@ -277,7 +277,7 @@ def test_part_file_of_a_killed_run_is_readable_and_reused(tmp_path):
 
 
 def test_renamed_part_file_is_not_locked_again(tmp_path, monkeypatch):
-    """A second run opens the part of the first, which is renamed before it can lock it."""
+    """A second run opens the part file of the first, which is renamed before it can be locked."""
     path = tmp_path / "a.csv"
     first, opened = PartFile(path), []
     first.path.write_text("first")

@@ -1,4 +1,4 @@
-"""The [hardware] tables of rig.toml: what they may say."""
+"""The [hardware] tables of rig.toml."""
 
 import tomllib
 

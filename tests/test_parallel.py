@@ -1,4 +1,4 @@
-"""Jobs in processes of their own: results, progress, and mistakes that end them."""
+"""Jobs in separate processes: results, progress, errors, signals, and orphans."""
 
 import contextlib
 import os
@@ -12,7 +12,7 @@ import pytest
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.parallel import run_apart
 
-DEADLINE_S = 60.0  # for what should come at once
+DEADLINE_S = 60.0  # far more than it takes
 
 
 def square(x, report):
@@ -34,9 +34,9 @@ def wait_for_ever(pipe_end, report):
 
 
 def test_result_comes_after_the_reports():
-    told = []
-    assert run_apart(square, (3,), lambda *given: told.append(given)) == 9
-    assert told == [("squaring", 1, 1)]
+    reports = []
+    assert run_apart(square, (3,), lambda *given: reports.append(given)) == 9
+    assert reports == [("squaring", 1, 1)]
 
 
 def test_error_of_a_job_is_raised():
@@ -78,25 +78,25 @@ if __name__ == "__main__":
 """
 
 
-class Hearing:
-    """In another process, what that does with Ctrl-C as soon as it lives."""
+class HandlerOfCtrlC:
+    """Unpickled in another process, its handler of Ctrl-C."""
 
     def __reduce__(self):
         return signal.getsignal, (signal.SIGINT,)
 
 
-def is_deaf(heard, report):
-    return heard == signal.SIG_IGN
+def is_ignored(handler, report):
+    return handler == signal.SIG_IGN
 
 
 def test_starting_jobs_ignore_an_interrupt():
     before = signal.getsignal(signal.SIGINT)
-    assert run_apart(is_deaf, (Hearing(),), lambda *_: None) is True
+    assert run_apart(is_ignored, (HandlerOfCtrlC(),), lambda *_: None) is True
     assert signal.getsignal(signal.SIGINT) == before
 
 
 def test_jobs_end_with_their_parent_however_it_ends(tmp_path):
-    """Its pipes are closed only when nobody holds them any more."""
+    """The pipes close only when no process holds them any more."""
     (tmp_path / "waiter.py").write_text(WAITER)
     with subprocess.Popen(
         [sys.executable, "waiter.py"], cwd=tmp_path, stdout=subprocess.PIPE, start_new_session=True,

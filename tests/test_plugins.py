@@ -1,4 +1,4 @@
-"""Drivers and detectors of a user's own, which rig.toml names and nobody puts into the package."""
+"""Drivers and detectors of a user, which rig.toml names."""
 
 import colorsys
 import json
@@ -193,7 +193,7 @@ def test_own_detector_beside_rig_toml_is_found(rig, monkeypatch):
     ('"devices:Camera"\ncolor = "red"', "unknown key 'hardware.fixed.color'; valid here: colour, driver, rate_hz, "),
     ('"devices:Camera"\nrate_hz = "9"', "hardware.fixed.rate_hz: '9'"),
     ('"device:Camera"', "hardware.fixed.driver: there is no module 'device'"),
-    # What the file imports is no driver of it.
+    # Imported names are not offered.
     ('"devices:Camer"', "hardware.fixed.driver: {folder}/devices.py has no 'Camer'; it has: Broken, Camera, CameraSet"),
     ('"devices:Unset"', "hardware.fixed.driver: {folder}/devices.py:Unset has no Settings"),
     ('"devices:Wrong"', "hardware.fixed.driver: spec of its Settings is no CameraSpec"),
@@ -229,7 +229,7 @@ KINDS = {"head": "Head", "zoom": "Zoom", "fixed": "Camera"}
 
 
 def with_other(rig, device, body):
-    """Let a device be another one, which differs from the usual by a body of its class."""
+    """Replace a device by a subclass with the given body."""
     kind = KINDS[device]
     (rig.parent / "devices.py").write_text(f"{DEVICES}\n\nclass Other({kind}):\n{body}")
     rig.write_text(RIG.replace(f'"devices:{kind}"', '"devices:Other"'))
@@ -315,7 +315,7 @@ class Slots:
 
 
 def test_an_own_file_may_have_the_name_of_another_module(rig):
-    """Of a module of Python that it imports itself, and of another own file in the same process."""
+    """The name of a module of Python that it imports, or of another own file in the same process."""
     other = rig.parent / "other"
     other.mkdir()
     text = f"from __future__ import annotations\n\nfrom colorsys import rgb_to_hls\n{DEVICES}"

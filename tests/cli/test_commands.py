@@ -1,4 +1,4 @@
-"""The commands do what they are for: JSON on stdout, tables and films, one line for what keeps them from it."""
+"""Results of the commands: JSON on stdout, tables, films and calibrations."""
 
 import json
 import math
@@ -40,7 +40,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-# Stands in for a machine without any OpenGL: neither found nor loaded.
+# Imitates a machine whose OpenGL libraries are neither found nor loaded.
 WITHOUT_OPENGL = """
 import ctypes, ctypes.util, sys
 load, find = ctypes.CDLL.__init__, ctypes.util.find_library
@@ -72,16 +72,16 @@ def test_follow_without_opengl_names_the_package_to_install(folder):
 
 
 def aim_json(capsys, *arguments):
-    """The JSON of an aim, and what is doubted of it, one line each."""
+    """The JSON of `aim`, and its warnings."""
     status, out, err = call(capsys, *AIM, *arguments)
     assert status == 0
     return json.loads(out), err.splitlines()
 
 
 def test_aim_prints_json_with_the_documented_keys(folder, capsys):
-    """By written-out matrices and OpenCV: the point is then in the middle of the zoom image."""
-    found, doubts = aim_json(capsys, "--pixel", "500", "240", "--depth", "10")
-    assert not doubts
+    """By written-out matrices and OpenCV, the point is then in the middle of the zoom image."""
+    found, warnings = aim_json(capsys, "--pixel", "500", "240", "--depth", "10")
+    assert not warnings
     assert found["depth_m"] == pytest.approx(10.0)
     assert found["focal_mm"] == pytest.approx(6.0)  # the shortest, where nothing says otherwise
     assert found["focal_px"] == pytest.approx(692.0)
@@ -104,55 +104,55 @@ def test_aim_prints_json_with_the_documented_keys(folder, capsys):
     ("2.6", ["--target", "person"], None),
 ])  # fmt: skip
 def test_aim_warns_of_a_depth_at_which_no_target_fits(folder, capsys, depth, more, nearest):
-    found, doubts = aim_json(capsys, "--depth", depth, *more)
+    found, warnings = aim_json(capsys, "--depth", depth, *more)
     assert found["depth_plausible"] is (nearest is None)
-    assert len(doubts) == (nearest is not None)
-    assert nearest is None or nearest in doubts[0]
+    assert len(warnings) == (nearest is not None)
+    assert nearest is None or nearest in warnings[0]
 
 
 def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, capsys):
     size = str(686 * 0.234 / 12)
-    found, doubts = aim_json(capsys, "--size-px", size, "--target", "book", "--wanted-px", "100", "--rig", "rig.toml")
+    found, warnings = aim_json(capsys, "--size-px", size, "--target", "book", "--wanted-px", "100", "--rig", "rig.toml")
     assert found["depth_m"] == pytest.approx(12.0, rel=1e-3)  # the pixel is not quite in the middle of the distortion
     assert found["focal_limited"] is False
     assert found["focal_px"] == pytest.approx(100 * found["range_m"] / 0.234, rel=1e-4)  # principal point 7 px off
     assert found["focal_mm"] == pytest.approx(6.0 * found["focal_px"] / 692)
     assert found["predicted_error_deg"]["size"] > 0
     assert found["focal_calibrated"] is False  # only 6 mm is
-    assert len(doubts) == 1
+    assert len(warnings) == 1
 
 
 def test_aim_warns_of_a_size_that_the_lens_cannot_show(folder, capsys):
-    """Of a person along v, whose focal length is another; thousands without an exponent; and what is as wanted, not."""
+    """The size is along the known dimension, in whole pixels or two digits; one as wanted is not mentioned."""
 
-    def told(depth, target):
-        found, doubts = aim_json(capsys, "--depth", depth, "--target", target, "--wanted-px", "160")
-        return found, [line for line in doubts if f"the lens shows the {target}" in line]
+    def aimed(depth, target):
+        found, warnings = aim_json(capsys, "--depth", depth, "--target", target, "--wanted-px", "160")
+        return found, [line for line in warnings if f"the lens shows the {target}" in line]
 
-    near, [line] = told("1", "person")
+    near, [line] = aimed("1", "person")
     shown = 1.75 * near["focal_px"] * 693 / 692 / near["range_m"]
     assert shown > 1000
     assert f" {shown:.0f} px " in line
-    far, [line] = told("3000", "book")
+    far, [line] = aimed("3000", "book")
     assert f" {0.234 * far['focal_px'] / far['range_m']:.2g} px " in line
     limit = 72.0 * 692 / 6.0 * 0.234 / 160  # range from which on the lens is too short [m]
-    depth = 2 * limit - told(f"{limit}", "book")[0]["range_m"]
-    for beyond, limited, is_told in ((0.998, False, False), (1.002, True, False), (1.008, True, True)):
-        book, lines = told(f"{depth * beyond}", "book")
-        assert (book["focal_limited"], bool(lines)) == (limited, is_told)
-    assert told("30", "book")[0]["focal_mm"] == pytest.approx(72.0)
+    depth = 2 * limit - aimed(f"{limit}", "book")[0]["range_m"]
+    for beyond, limited, warned in ((0.998, False, False), (1.002, True, False), (1.008, True, True)):
+        book, lines = aimed(f"{depth * beyond}", "book")
+        assert (book["focal_limited"], bool(lines)) == (limited, warned)
+    assert aimed("30", "book")[0]["focal_mm"] == pytest.approx(72.0)
 
 
 @pytest.mark.parametrize("focal_mm", ["6", "50", "72"])
 def test_aim_takes_a_focal_length(folder, capsys, focal_mm):
-    found, doubts = aim_json(capsys, "--depth", "9", "--focal-mm", focal_mm)
+    found, warnings = aim_json(capsys, "--depth", "9", "--focal-mm", focal_mm)
     assert found["focal_mm"] == pytest.approx(float(focal_mm))
-    assert found["focal_calibrated"] is (not doubts) is (focal_mm == "6")
+    assert found["focal_calibrated"] is (not warnings) is (focal_mm == "6")
 
 
 @pytest.mark.parametrize("method", ["paper-table", "paper-example"])
 def test_aim_takes_the_papers_inverse_kinematics(folder, capsys, method):
-    """Its readings differ from the exact one by less than a degree near the axis; the prediction is of the exact."""
+    """Its readings differ from the exact one by less than a degree near the axis, and have no predicted error."""
     exact, found = (aim_json(capsys, "--depth", "10", "--ik", each)[0] for each in ("exact", method))
     apart = math.hypot(found["pan_deg"] - exact["pan_deg"], found["tilt_deg"] - exact["tilt_deg"])
     assert 1e-4 < apart < 1
@@ -160,7 +160,7 @@ def test_aim_takes_the_papers_inverse_kinematics(folder, capsys, method):
 
 
 def test_calibrate_takes_photos_of_a_chessboard(folder, capsys):
-    """Boards drawn by a homography: the intrinsics come back, and JSON tells the residuals."""
+    """Boards are drawn by a homography."""
     truth, board = Truth(), BoardConfig(square=0.1)
     rng = np.random.default_rng(0)
     rays = {lens: pixel_rays(lens) for lens in (truth.fixed, truth.zoom)}
@@ -174,10 +174,10 @@ def test_calibrate_takes_photos_of_a_chessboard(folder, capsys):
     status, out, err = call(capsys, *FROM, "photos", *PHOTOS, "9x6")
     assert status == 0
     assert err.splitlines()[-1].startswith("not used: 2 of 17 images; new.json")
-    told = json.loads(out)
-    assert told["calibration"] == "new.json"
-    assert told["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
-    assert max(told["fixed_rms_px"], told["zoom_rms_px"], told["stereo_rms_px"]) < 0.1
+    printed = json.loads(out)
+    assert printed["calibration"] == "new.json"
+    assert printed["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
+    assert max(printed["fixed_rms_px"], printed["zoom_rms_px"], printed["stereo_rms_px"]) < 0.1
     saved = json.loads((folder / "new.json").read_text())
     assert saved["T_head_zoom"] is None
     alone = {"name": "left99.png", "reason": "has no partner with the same number"}
@@ -185,7 +185,7 @@ def test_calibrate_takes_photos_of_a_chessboard(folder, capsys):
 
 
 def test_calibrate_takes_photos_of_a_charuco_board(folder, capsys):
-    """8x6 corners, which no plain chessboard may have, seen by two cameras without any distortion."""
+    """8x6 corners, which a plain chessboard must not have, seen by two cameras without distortion."""
     truth, rng, square_px = Truth(), np.random.default_rng(0), 40
     picture = draw_board(BoardConfig("charuco", (8, 6), 0.1), square_px)
     first = 2 * square_px - 0.5  # where the first inner corner is drawn
@@ -199,9 +199,9 @@ def test_calibrate_takes_photos_of_a_charuco_board(folder, capsys):
             cv2.imwrite(str(folder / "photos" / f"{side}{number}.png"), photo)
     status, out, err = call(capsys, *FROM, "photos", *PHOTOS, "8x6", "--kind", "charuco")
     assert (status, err) == (0, "")
-    told = json.loads(out)
-    assert told["fixed_views"] == told["zoom_views"] == 8
-    assert told["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
+    printed = json.loads(out)
+    assert printed["fixed_views"] == printed["zoom_views"] == 8
+    assert printed["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
     assert json.loads((folder / "new.json").read_text())["board"]["kind"] == "charuco"
 
 
@@ -237,7 +237,7 @@ def zooming(tmp_path_factory):
 
 @pytest.mark.slow
 def test_calibrate_with_insist_accepts_pan_alone_at_every_focal_length(folder, capsys, zooming):
-    """With pan alone the first fit, of the shortest focal length, is refused already."""
+    """With pan alone, the first fit, at the shortest focal length, is refused."""
     directory, rows = zooming
     write_index(directory, [row for row in rows if row["tilt"] == 0])
     assert "only pan moved" in refused(capsys, *FROM, directory)
@@ -259,8 +259,8 @@ def test_sequential_method_rejects_images_at_other_focal_lengths(folder, capsys,
     assert json.loads(out)["rejected"] == 4
     assert f"not used: 4 of {len(rows)} images" in err
     far = [row["file"] for row in rows if row["focal_px"] == 2 * NOMINAL_PX]
-    told = json.loads((folder / "new.json").read_text())["residuals"]["rejected"]
-    assert told == [
+    printed = json.loads((folder / "new.json").read_text())["residuals"]["rejected"]
+    assert printed == [
         {"name": name, "reason": "taken at 1334 px, not at the shortest focal length, 667 px"} for name in far
     ]
 
@@ -269,12 +269,12 @@ def test_sequential_method_rejects_images_at_other_focal_lengths(folder, capsys,
 def test_follow_writes_a_table_and_a_film(folder, capsys):
     status, out, err = call(capsys, *FOLLOW, "--seconds", "0.3")
     assert (status, err) == (0, "")
-    told = json.loads(out)
+    printed = json.loads(out)
     lines = (folder / "out.csv").read_text().splitlines()
-    assert told["steps"] == len(lines) - 1 == sum(told["states"].values())
-    assert told["steps"] >= 6
+    assert printed["steps"] == len(lines) - 1 == sum(printed["states"].values())
+    assert printed["steps"] >= 6
     capture = cv2.VideoCapture(str(folder / "out.mp4"))
-    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == told["steps"]
+    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == printed["steps"]
     capture.release()
 
 
@@ -283,12 +283,12 @@ def test_detect_writes_a_table(folder, capsys):
     detect = ("detect", "sky.mp4", "--target", "bird", "--csv")
     status, out, err = call(capsys, *detect, "out.csv")
     assert (status, err) == (0, "")
-    told, table = json.loads(out), (folder / "out.csv").read_text()
-    assert (told["frames"], told["tracks"]) == (60, 1)
-    assert told["frames_with_target"] > 20
+    printed, table = json.loads(out), (folder / "out.csv").read_text()
+    assert (printed["frames"], printed["tracks"]) == (60, 1)
+    assert printed["frames_with_target"] > 20
     assert table.startswith("frame,t,track,u_px,v_px,width_px,height_px,score\n")
     status, out, err = call(capsys, *detect, "-")  # the table goes to stdout, and the summary to stderr
-    assert (status, out, json.loads(err)) == (0, table, told)
+    assert (status, out, json.loads(err)) == (0, table, printed)
     assert not (folder / "-").exists()
 
 

@@ -1,4 +1,4 @@
-"""What commands keep when they end early, and what they say of a run in which much went wrong."""
+"""Files of commands that end early, exit statuses, and warnings at the end of a run."""
 
 import csv
 import json
@@ -28,7 +28,7 @@ FRAMES = 9  # before it ends
 
 
 class WatchedRig(ToyDevices):
-    """Notes what was written when the head was halted and the rig was closed."""
+    """Notes the table's content when the rig is closed, which must be after a halt."""
 
     def __init__(self, folder, failing):
         super().__init__(failing)
@@ -42,7 +42,7 @@ class WatchedRig(ToyDevices):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A working folder with a rig, a calibration and a result of before."""
+    """A working folder with a rig, a calibration and an earlier result."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cotarget.detection.make_detector", lambda *_: Bright())
     (tmp_path / "rig.toml").write_text('[sim]\ntargets = ["bird"]\n[safety]\nstop_file = "stop"\n')
@@ -95,7 +95,7 @@ def test_recording_ended_by_ctrl_c_is_replayed(folder, capsys, monkeypatch):
 
 @pytest.mark.parametrize("failing", ["head.move", "fixed.read"])
 def test_recording_of_a_failed_device_is_replayed_to_its_end(folder, capsys, caplog, monkeypatch, failing):
-    """The head of the recorded run was lost, so its halts failed too; the replay has no head that could go on."""
+    """The halts of the recorded run failed too."""
     lost = DeviceError("the line is lost")
     accident = {(failing, FRAMES): lost} | {("head.halt", number): lost for number in range(1, 50)}
     monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig(accident))
@@ -174,19 +174,19 @@ def test_interrupted_detect_keeps_the_tracks_so_far(folder, capsys, monkeypatch)
 
 
 def test_follow_reports_why_a_target_was_not_followed(folder, capsys, monkeypatch):
-    """A head that may hardly turn: the bird, 10 to 15 degrees off the axis, is beyond its limits and never followed."""
+    """The bird, 10 to 15 degrees off the axis, is beyond the limits of a head that turns by one degree."""
     with (folder / "rig.toml").open("a") as file:
         file.write("pan_deg = [-1, 1]\n")
     monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig())
     status, out, err = call(capsys, *FOLLOW, "--seconds", "1")
     assert status == 4
-    told = json.loads(out)
-    assert list(told["reasons"].values()) == sorted(told["reasons"].values(), reverse=True)
+    printed = json.loads(out)
+    assert list(printed["reasons"].values()) == sorted(printed["reasons"].values(), reverse=True)
     [line] = err.splitlines()
-    beyond, count = next((name, count) for name, count in told["reasons"].items() if "beyond the limits" in name)
+    beyond, count = next((name, count) for name, count in printed["reasons"].items() if "beyond the limits" in name)
     assert beyond.startswith("the point needs pan #, tilt #")
     assert line.startswith("cotarget follow: ")
-    assert f"{count} of {told['steps']} frames: the point needs pan " in line
+    assert f"{count} of {printed['steps']} frames: the point needs pan " in line
     assert "beyond the limits pan -1 to 1," in line
 
 
@@ -218,7 +218,7 @@ stop_file = "stop"
 
 
 class SlowDevices(ToyDevices):
-    """Works on every third frame of 25 Hz: each takes 100 ms more."""
+    """Devices of which every frame takes 100 ms more, so that every third frame of 25 Hz is used."""
 
     def count(self, what):
         super().count(what)
@@ -232,34 +232,34 @@ def test_skipped_frames_are_counted_and_keep_their_time_in_table_and_film(folder
         (folder / "rig.toml").write_text(HARDWARE)
     monkeypatch.setitem(OPENERS, backend, lambda config: rig_of(SlowDevices()))
     status, out, err = call(capsys, *FOLLOW, "--seconds", "3", "--insist")  # no unit's lens is like the toy's
-    told = json.loads(out)
+    printed = json.loads(out)
     with (folder / "out.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     times = np.array([float(row["t_fixed_s"]) for row in rows])
     frames = round((times[-1] - times[0]) * 25) + 1
-    assert (status, told["skipped"]) == (0, frames - len(rows))
+    assert (status, printed["skipped"]) == (0, frames - len(rows))
     assert [int(row["skipped"]) for row in rows[1:]] == list(np.round(np.diff(times) * 25).astype(int) - 1)
     assert rows[0]["skipped"] == "0"
     assert frames > 2 * len(rows) > 50
-    assert f"cotarget follow: {told['skipped']} of {frames} frames of the fixed camera were skipped" in err
+    assert f"cotarget follow: {printed['skipped']} of {frames} frames of the fixed camera were skipped" in err
     with Film(folder / "out.mp4") as film:
         assert [frame.t for frame in film] == pytest.approx(list(times - times[0]), abs=1e-3)
     with av.open(str(folder / "out.mp4")) as film:
         created = film.metadata.get("creation_time")
     if backend == "sim":
-        assert (told["started"], created) == (None, None)
+        assert (printed["started"], created) == (None, None)
         assert {row["utc"] for row in rows} == {""}
         return
     by_the_wall = [datetime.fromisoformat(row["utc"]) for row in rows]
     seconds = [(each - by_the_wall[0]).total_seconds() for each in by_the_wall]
     assert seconds == pytest.approx(list(times - times[0]), abs=2e-3)  # written in milliseconds
-    assert (by_the_wall[0] - datetime.fromisoformat(told["started"])).total_seconds() == 0
+    assert (by_the_wall[0] - datetime.fromisoformat(printed["started"])).total_seconds() == 0
     assert abs((datetime.now(UTC) - by_the_wall[0]).total_seconds()) < 60
     assert abs((datetime.fromisoformat(created) - by_the_wall[0]).total_seconds()) < 1.01  # in whole seconds
 
 
 def reasons_of(*runs):
-    """Of runs of (how many Steps, their reason, whether there is a target)."""
+    """Reasons of runs of steps: their number, their reason, and whether they have a target."""
     reasons, plain = Reasons(), step(0.0)
     for count, reason, seen in runs:
         for _ in range(count):
@@ -268,7 +268,7 @@ def reasons_of(*runs):
 
 
 @pytest.mark.parametrize("runs", [
-    [(500, "nothing is detected", False)],  # told in other words
+    [(500, "nothing is detected", False)],  # reported by the hint
     [(300, "nothing is detected", False), (100, "", True)],
     [(10, "what is detected is not confirmed yet", False), (90, "", True), (40, "zoom: unsure", True)],
     [(60, "", True), (50, "out of sight for 0.5 s; looked for where it should be", True)],

@@ -1,4 +1,4 @@
-"""No result replaces what a command reads: whatever is named, everything stays as it was, and one line says why."""
+"""Outputs that would replace an input are refused in one line."""
 
 import os
 
@@ -38,7 +38,7 @@ RECORDING = ("run/log.jsonl", "run/meta.json", "run/fixed/000000.png", "run/fixe
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Everything that commands read."""
+    """A folder with everything that commands read."""
     folder = tmp_path_factory.mktemp("made")
     record(folder / "run", calibration_file(folder), seconds=0.2)
     (folder / "rig.toml").write_text(RIG.format(backend="sim"))
@@ -59,7 +59,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def folder(made, monkeypatch):
-    """It is the working folder, and nothing in it has changed afterwards."""
+    """The working folder, in which the test must change nothing."""
     monkeypatch.chdir(made)
     monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig())
     before = contents(made)
@@ -154,7 +154,7 @@ def test_output_that_is_a_link_is_written_at_its_target(folder, capsys, tmp_path
 
 @pytest.mark.parametrize("name", ["calibration.json", "calib", "left.txt"])
 def test_calibration_may_be_written_beside_its_photos(folder, capsys, tmp_path, name):
-    """There is one already, which is what is to be replaced; what is wrong here are the photos."""
+    """The earlier calibration is no obstacle; the command fails because there are too few photos."""
     photos = tmp_path / "photos"
     photos.mkdir()
     for photo in ("left1.png", "right1.png"):
@@ -170,7 +170,7 @@ def test_calibration_may_be_written_beside_its_photos(folder, capsys, tmp_path, 
 
 @pytest.mark.parametrize("name", ["left1.png", "calib"])
 def test_calibration_never_replaces_a_captured_image(folder, capsys, tmp_path, name):
-    """Of captures with an index, what it lists is read."""
+    """A folder of captures has the images that its index lists."""
     cv2.imwrite(str(tmp_path / "left1.png"), board_photo())
     write_index(tmp_path, [capture("left1.png")])
     (tmp_path / "calib").write_text(OLD)

@@ -1,4 +1,4 @@
-"""What an operator does with a rig: stop, clear, reset-head, latency, doctor, board; else the head is left alone."""
+"""Commands of an operator: stop, clear, reset-head, latency, board; and consent before the head moves."""
 
 import io
 import json
@@ -59,7 +59,7 @@ LATENCY = ("latency", "--rig", "hw.toml")
 
 @pytest.mark.parametrize("command", [FOLLOW, ("calibrate", "--rig", "hw.toml"), ("point", "--rig", "hw.toml"), LATENCY])
 def test_stopped_rig_is_not_opened(folder, capsys, command):
-    """Its devices are not there, of which nothing is said."""
+    """Opening it would report that its devices do not exist."""
     assert call(capsys, "stop", "--rig", "hw.toml")[0] == 0
     assert refused(capsys, *command).startswith(f"cotarget {command[0]}: emergency stop: stopped by the operator")
     call(capsys, "clear", "--rig", "hw.toml")
@@ -102,7 +102,7 @@ def test_missing_folder_of_the_stop_file_fails_stop_and_point(folder, capsys):
 
 @pytest.mark.parametrize("command", ["stop", "--help"])
 def test_stop_and_help_import_nothing_heavy(folder, command):
-    """On a machine that is busy with following, numpy and scipy alone take seconds."""
+    """On a busy machine, importing numpy and scipy takes seconds."""
     arguments = ["stop", "--rig", "stops.toml"] if command == "stop" else [command]
     program = (
         "import contextlib, sys; from cotarget import cli\n"
@@ -120,7 +120,7 @@ def test_stop_and_help_import_nothing_heavy(folder, command):
 
 @pytest.mark.parametrize(("delay", "configured"), [(0.02, 0.08), (-0.06, 0.0), (-0.065, 0.0), (-0.2, None)])
 def test_latency_refuses_a_clearly_negative_delay(folder, capsys, monkeypatch, delay, configured):
-    """Frames of the default simulation are dated by 60 ms; less than zero by what is measured inaccurately is zero."""
+    """The default simulation has 60 ms; a sum slightly below zero is zero."""
     found = HeadLatency(Delay(delay, 0.99), command=0.04, frames=100)
     monkeypatch.setattr("cotarget.latency.measure_head", lambda rig: found)
     monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(SimulatedDevices()))
@@ -145,7 +145,7 @@ def test_help_lists_faults_and_exit_statuses(capsys, command, words):
 
 @pytest.fixture
 def resets(monkeypatch):
-    """Resets that were asked for, none of which is done."""
+    """Serial ports whose heads would have been reset."""
     asked = []
 
     def reset(settings, clock, safety, stopped):
@@ -207,7 +207,7 @@ def test_board_prints_its_table_of_rig_toml(folder, capsys):
 
 
 def test_tables_copied_for_an_emulated_rig_have_absolute_paths(tmp_path):
-    """Paths are relative to the rig.toml that they stand in; those of what is written elsewhere are whole."""
+    """Paths are relative to their rig.toml, so in another folder they must be absolute."""
     table = {
         "sim": {"seed": 1},
         "board": {"square": 0.05},

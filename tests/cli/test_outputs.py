@@ -1,4 +1,4 @@
-"""What commands leave behind: earlier results kept, progress where nobody looks, numbers as people write them."""
+"""Earlier results that commands keep, progress on stderr, and numbers in JSON."""
 
 import json
 import math
@@ -39,7 +39,7 @@ def names(folder):
 
 @pytest.mark.parametrize("linked", [False, True])
 def test_previous_results_are_kept_beside_the_new_one(folder, capsys, linked):
-    """Beside the goal of a link, which stays one."""
+    """Of a link, the target is kept."""
     path = goal = folder / "c.json"
     if linked:
         path = folder / "link.json"
@@ -77,7 +77,7 @@ def test_previous_result_is_copied_where_links_fail(folder, monkeypatch):
 
 
 class Session:
-    """A capture session that takes an image and then fails, or not."""
+    """A capture session that takes an image and then may fail."""
 
     def __init__(self, error=None):
         self.error = error
@@ -93,7 +93,7 @@ class Session:
 
 @pytest.fixture
 def sessions(folder, monkeypatch):
-    """Lets `calibrate --rig` open a rig without a world; its session is what a test says."""
+    """Let `calibrate --rig` open a rig without a world, with a replaced session."""
     rig = SimulatedDevices()
     rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, describe(RigConfig()).zoom.focal_range  # 12 x zoom
     monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig, config=config))
@@ -128,7 +128,7 @@ def test_refused_session_does_not_offer_earlier_captures(folder, capsys, session
     (3, 4, "3 zoom samples are 3.5 times apart"), (4, 4, None), (9, 9, None),
 ])  # fmt: skip
 def test_zoom_samples_too_far_apart_get_others_between_them(capsys, caplog, monkeypatch, sessions, stops, taken, said):
-    """Each at most 2.5 times the one before: from 1 to 12 by 2.29 takes three steps."""
+    """Neighbours differ by a factor of at most 2.5: from 1 to 12, three steps by 2.29."""
     asked = {}
 
     def session(*_, **given):
@@ -189,7 +189,7 @@ def test_progress_on_a_terminal_is_a_bar_beside_the_results():
     assert made.stdout == b"a result\n"
     assert "board [8]" in shown
     assert "100%" in shown
-    assert "\x1b[2Ka remark\r\n" in shown  # on a line of its own
+    assert "\x1b[2Ka remark\r\n" in shown  # on a separate line
     assert shown.endswith("\x1b[2K")  # the line is cleared
 
 

@@ -1,4 +1,4 @@
-"""Which of several targets a command follows, as its options or the recording say."""
+"""Selection of one of several targets by options, or by a recording."""
 
 import argparse
 import json
@@ -52,7 +52,7 @@ def test_policy_names_are_those_of_the_selectors():
     (("--track", "3"), {"track": 5}, 3),
 ])  # fmt: skip
 def test_options_or_recording_select_the_target(arguments, recorded, number):
-    """Of three: one to the left that stays, one in the middle that leaves in 9 s, one to the right, in 5 s."""
+    """Of three targets: one at the left stays, one in the middle leaves in 9 s, and one at the right in 5 s."""
     places = {2: (100, 200), 3: (320, 200), 5: (600, 200)}
     seen_s = (0.0, 2.0, 2.0) if "most-served" in arguments else (0.0, 0.0, 0.0)
     candidates = [
@@ -96,7 +96,7 @@ def test_follow_passes_the_selection_on(tmp_path, capsys):
     command = ("follow", "--rig", tmp_path / "rig.toml", "--calibration", tmp_path / "good.json", "--target", "book")
     for number, state in (("1", "following"), ("9", "searching")):
         status, out, err = call(capsys, *command, "--seconds", "0.3", "--track", number)
-        told = json.loads(out)
+        printed = json.loads(out)
         assert status == (0 if state == "following" else 4)
-        assert told["states"][state] >= told["steps"] - 4  # a track needs four detections
+        assert printed["states"][state] >= printed["steps"] - 4  # a track needs four detections
         assert ("--track: " in err) == (state == "searching")

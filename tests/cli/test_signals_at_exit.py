@@ -1,4 +1,4 @@
-"""A program that is ended by signals, at its end or by surprise: the head is halted, and the devices are released."""
+"""A program that signals end: the head is halted, and the devices are released."""
 
 import contextlib
 import json
@@ -17,7 +17,7 @@ from cotarget.config import RigConfig
 from tests.support.commands import true_calibration
 from tests.support.safety_rigs import DEADLINE_S
 
-# A program with a rig in real time that says what its devices are told; a halt waits for a line on stdin.
+# A program with a rig in real time that prints the calls of its devices; a halt waits for a line on stdin.
 PROGRAM = """
 import sys, time
 from tests.support.safety_rigs import RealDevices
@@ -108,7 +108,7 @@ class Child:
             time.sleep(0.01)
 
     def finish(self, answers=8):
-        """Answer every halt from now on; its exit status, all of its lines and what it said on stderr."""
+        """Answer every halt from now on; return exit status, all lines of stdout, and stderr."""
         out, err = self.process.communicate(b"\n" * answers, timeout=3 * DEADLINE_S)
         self.lines += (self.rest + out).decode().splitlines()
         return self.process.returncode, self.lines, err.decode()
@@ -167,7 +167,7 @@ def test_ctrl_z_halts_the_head_before_it_suspends_the_program(start, number):
 
 
 def test_program_is_not_suspended_while_its_head_cannot_be_halted(start):
-    """Its watchdog goes on trying."""
+    """Its watchdog keeps trying."""
     broken = (
         "tries = []\ndef halt():\n    tries.append(1)\n    say('tried')\n    if len(tries) < 3: raise OSError('dead')\n"
     )
@@ -232,7 +232,7 @@ def test_program_keeps_its_own_signal_handlers(start):
     pytest.param(signal.SIGHUP, 129, "terminated", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_follow_ended_by_a_signal_halts_the_head(start, tmp_path, number, status, said):
-    """A second signal comes while the head is being halted; only then is the table completed, with what there is."""
+    """A second signal comes while the head is being halted; the table is completed afterwards."""
     (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
     save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
     child = start(FOLLOW)
@@ -244,8 +244,8 @@ def test_follow_ended_by_a_signal_halts_the_head(start, tmp_path, number, status
     returned, lines, err = child.finish()
     if number == signal.SIGINT:  # the run's JSON comes last, and its counts are those of the table
         at = lines.index("{")
-        lines, told = lines[:at], json.loads("\n".join(lines[at:]))
-        assert told["steps"] == len((tmp_path / "steps.csv").read_text().splitlines()) - 1
+        lines, printed = lines[:at], json.loads("\n".join(lines[at:]))
+        assert printed["steps"] == len((tmp_path / "steps.csv").read_text().splitlines()) - 1
     last = len(lines) - lines[::-1].index("moving") if "moving" in lines else 0
     assert lines[last:] in (
         ["moved", "halting", "halted", "halting", "halted", "closing", "closed"],

@@ -1,4 +1,4 @@
-"""The scene as somebody watches it: frusta that end where the images do, a page on this machine, and clean endings."""
+"""The viewer: frusta, pictures, real time, and the page for a browser."""
 
 import gc
 import itertools
@@ -90,8 +90,8 @@ def test_copy_of_the_world_keeps_its_state(world):
     np.testing.assert_array_equal(shown.data.body("rig/zoom").xpos, eye)
 
 
-class People:
-    """People's time, which passes only when somebody waits."""
+class WallClock:
+    """Wall-clock time that passes only in `sleep`."""
 
     def __init__(self):
         self.t = 0.0
@@ -104,7 +104,7 @@ class People:
 
 
 class Window:
-    """Notes when it was shown what; closed by somebody after so many moments."""
+    """Notes the times of its snapshots; closes after a number of them."""
 
     def __init__(self, clock, closed_after=1000):
         self.clock, self.shown, self._closed_after = clock, [], closed_after
@@ -123,7 +123,7 @@ def moments(clock, took):
 
 
 def test_snapshots_are_shown_in_real_time_without_catching_up():
-    clock = People()
+    clock = WallClock()
     window = Window(clock)
     running.watch(moments(clock, [0.0, 0.02, 0.02, 0.5, 0.02]), window, clock.now, clock.sleep)
     np.testing.assert_allclose([at for _, at in window.shown], [0.0, 0.02, 0.12, 0.7, 0.72])
@@ -131,7 +131,7 @@ def test_snapshots_are_shown_in_real_time_without_catching_up():
 
 
 def test_watching_ends_when_the_window_is_closed():
-    clock = People()
+    clock = WallClock()
     window = Window(clock, closed_after=2)
     running.watch(moments(clock, [0.0] * 9), window, clock.now, clock.sleep)
     assert len(window.shown) == 2
@@ -139,7 +139,7 @@ def test_watching_ends_when_the_window_is_closed():
 
 @pytest.mark.parametrize("target", [(), ("--target", "book")])
 def test_view_shows_the_rig_at_rest_or_the_pipeline(tmp_path, capsys, monkeypatch, target):
-    clock, shown = People(), []
+    clock, shown = WallClock(), []
     (tmp_path / "rig.toml").write_text('[sim]\ntargets = ["book"]\n')
 
     class Shown(Window):
@@ -166,7 +166,7 @@ def test_view_shows_the_rig_at_rest_or_the_pipeline(tmp_path, capsys, monkeypatc
 
 @pytest.fixture
 def unserved(monkeypatch):
-    """A web viewer whose thread ends at once; it notes what was closed."""
+    """A web viewer whose thread ends at once and which notes that it was closed."""
     closed = []
 
     def launch(serve):
@@ -199,7 +199,7 @@ def test_failed_page_releases_viewer_and_port(world, monkeypatch, unserved, fail
 
 @pytest.mark.parametrize("window", [(1200, 900), (333, 777), (90, 70)])
 def test_window_pictures_fill_their_places_one_above_the_other(window):
-    """MuJoCo draws as many pixels as the place has, whatever the picture's own size."""
+    """MuJoCo draws as many pixels as the place has, whatever the size of the picture."""
     blue, red = np.zeros((480, 640, 3), np.uint8), np.zeros((200, 320, 3), np.uint8)
     blue[..., 0] = red[..., 2] = 255
     placed = desktop.placed_pictures([blue, red], *window)

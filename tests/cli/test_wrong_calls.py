@@ -1,4 +1,4 @@
-"""Wrong calls of all commands: exit status, one line that names command and option, key or file, and no file made."""
+"""Wrong calls end in one line that names command and option, key or file, and make no file."""
 
 import shlex
 import socket
@@ -232,7 +232,7 @@ OPENED = [
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A folder with good rigs and calibrations, old results, and much that is no good."""
+    """A folder with good and wrong rigs and calibrations, and old results."""
     folder = tmp_path_factory.mktemp("calls")
     for name in ("folder", "index", "cut", "no_fixed", "no_zoom", "grey", "single"):
         (folder / name).mkdir()
@@ -258,7 +258,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def folder(made, monkeypatch):
-    """It is the working folder, and nothing in it has changed afterwards."""
+    """The working folder, in which the test must change nothing."""
     monkeypatch.chdir(made)
     for name in ("COTARGET_PASSWORD", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
