@@ -122,17 +122,12 @@ def _notes(end: BaseException) -> list[str]:
 
 
 DESCRIPTION = "A fixed camera finds a small target; a zoom camera on a pan-tilt head shows it large."
-
-
 FOLLOW_STATUSES = (
     "exit status: 0 the target was followed; 1 an error; 2 a wrong option; 3 the zoom camera mostly did not show the "
     "target; 4 no target was followed; 130 Ctrl-C ended a run with --seconds"
 )
 
-
-def file_option(parser: argparse.ArgumentParser, name: str, about: str, metavar: str = "FILE", **more: Any) -> None:
-    """Add an option or argument that names a file or folder."""
-    parser.add_argument(name, type=Path, metavar=metavar, help=about, **more)
+Command = Callable[[str, Callable[[argparse.Namespace], int | None], str], Parser]  # adds a parser of one command
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -147,15 +142,15 @@ def make_parser() -> argparse.ArgumentParser:
         made.set_defaults(run=run)
         return made
 
-    def outputs(made: Parser) -> None:
-        file_option(made, "--csv", "write one line a step; -: to stdout")
-        file_option(made, "--video", "write a side-by-side video (.mp4)")
+    for add_commands in (_add_calibration, _add_following, _add_operation, _add_inspection):
+        add_commands(command)
+    return parser
 
-    def insist(made: Parser) -> None:
-        made.add_argument("--insist", action="store_true", help="accept what is far outside of anything plausible")
 
+def _add_calibration(command: Command) -> None:
+    """Add demo, calibrate and report."""
     demo = command("demo", running.demo_command, "calibrate a simulated rig and follow a book, a person and a bird")
-    file_option(demo, "--out", "where to write (demo-out)", "DIR", default=Path("demo-out"))
+    _add_file(demo, "--out", "where to write (demo-out)", "DIR", default=Path("demo-out"))
     demo.add_argument("--seed", type=whole(0), default=0, help="seed of everything random (0)")
 
     calibrate = command(
@@ -165,8 +160,8 @@ def make_parser() -> argparse.ArgumentParser:
     source.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml: drive that rig through a capture plan")
     source.add_argument("--from", type=Path, metavar="DIR", dest="source", help="captures taken earlier, or photos")
     about = "file to write (calibration.json); an earlier one is kept under another name"
-    file_option(calibrate, "--out", about, default=Path("calibration.json"))
-    file_option(calibrate, "--captures", "with --rig: keep the images in this folder", "DIR")
+    _add_file(calibrate, "--out", about, default=Path("calibration.json"))
+    _add_file(calibrate, "--captures", "with --rig: keep the images in this folder", "DIR")
     calibrate.add_argument("--fixed", metavar="GLOB", help="photos of the fixed camera, such as 'left*.jpg'")
     calibrate.add_argument(
         "--zoom", metavar="GLOB", help="photos of the zoom camera, paired by the numbers in their names"
@@ -201,13 +196,16 @@ def make_parser() -> argparse.ArgumentParser:
     )
 
     report = command("report", calibrating.report_command, "write a page on how far a calibration can be trusted")
-    file_option(report, "calibration", "calibration.json")
-    file_option(report, "--out", "file to write (report.html)", "PAGE", default=Path("report.html"))
-    insist(report)
+    _add_file(report, "calibration", "calibration.json")
+    _add_file(report, "--out", "file to write (report.html)", "PAGE", default=Path("report.html"))
+    _add_insist(report)
 
+
+def _add_following(command: Command) -> None:
+    """Add aim, follow and replay."""
     about = "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout"
     aim = command("aim", operating.aim_command, about)
-    file_option(aim, "--calibration", "calibration.json", required=True)
+    _add_file(aim, "--calibration", "calibration.json", required=True)
     aim.add_argument("--pixel", type=float, nargs=2, required=True, metavar=("U", "V"), help="pixel of the fixed image")
     how_far = aim.add_mutually_exclusive_group(required=True)
     how_far.add_argument("--depth", type=positive, metavar="M", help="depth along the fixed camera's axis [m]")
@@ -218,69 +216,72 @@ def make_parser() -> argparse.ArgumentParser:
     how_close = aim.add_mutually_exclusive_group()
     how_close.add_argument("--wanted-px", type=positive, metavar="N", help="wanted size in the close-up [px]")
     how_close.add_argument("--focal-mm", type=positive, metavar="F", help="focal length to use [mm]")
-    file_option(aim, "--rig", "rig.toml, for limits and targets (the default rig)")
+    _add_file(aim, "--rig", "rig.toml, for limits and targets (the default rig)")
     aim.add_argument(
         "--ik",
         choices=("exact", "paper-table", "paper-example"),
         default="exact",
         help="inverse kinematics: exact, or a reading of the paper's shortcut (exact)",
     )
-    insist(aim)
+    _add_insist(aim)
 
     follow = command("follow", following.follow_command, "follow a target with a calibrated rig")
-    file_option(follow, "--rig", "rig.toml", required=True)
-    file_option(follow, "--calibration", "calibration.json", required=True)
+    _add_file(follow, "--rig", "rig.toml", required=True)
+    _add_file(follow, "--calibration", "calibration.json", required=True)
     follow.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
     add_selection(follow)
     follow.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
-    outputs(follow)
-    file_option(follow, "--record", "record everything, for cotarget replay", "DIR")
-    insist(follow)
+    _add_outputs(follow)
+    _add_file(follow, "--record", "record everything, for cotarget replay", "DIR")
+    _add_insist(follow)
     follow.epilog = FOLLOW_STATUSES
 
     replay = command("replay", following.replay_command, "run the pipeline again on a recording of follow --record")
-    file_option(replay, "recording", "folder of the recording", "DIR")
+    _add_file(replay, "recording", "folder of the recording", "DIR")
     add_selection(replay, "as in the recorded run")
     about = "end with status 1 if the commands differ from the recorded ones"
     replay.add_argument("--check", action="store_true", help=about)
     about = "score the tracks by these labels: a csv as for detect, whose frame is the image number in DIR/fixed"
-    file_option(replay, "--labels", about)
-    outputs(replay)
+    _add_file(replay, "--labels", about)
+    _add_outputs(replay)
 
+
+def _add_operation(command: Command) -> None:
+    """Add the commands that operate a rig, and emulate."""
     about = "move head and lens to given values, and take a picture with each camera"
     point = command("point", operating.point_command, about)
-    file_option(point, "--rig", "rig.toml", required=True)
+    _add_file(point, "--rig", "rig.toml", required=True)
     point.add_argument("--pan-deg", type=number, metavar="A", help="pan, positive to the right (unchanged)")
     point.add_argument("--tilt-deg", type=number, metavar="A", help="tilt, positive up (unchanged)")
     point.add_argument("--focal-mm", type=positive, metavar="F", help="focal length [mm] (unchanged)")
     about = "write fixed.png and zoom.png to this folder; earlier ones are kept under other names"
-    file_option(point, "--pictures", about, "DIR")
+    _add_file(point, "--pictures", about, "DIR")
 
     about = "measure the latencies and command delays of cameras, head and lens"
     latency = command("latency", operating.latency_command, about)
-    file_option(latency, "--rig", "rig.toml", required=True)
+    _add_file(latency, "--rig", "rig.toml", required=True)
     about = "calibration.json; measures the fixed camera too, by a board that is swung"
-    file_option(latency, "--calibration", about)
-    insist(latency)
+    _add_file(latency, "--calibration", about)
+    _add_insist(latency)
 
     about = "emergency stop of every rig that watches this rig.toml's stop file"
     stop = command("stop", operating.stop_command, about)
-    file_option(stop, "--rig", "rig.toml", required=True)
+    _add_file(stop, "--rig", "rig.toml", required=True)
     about = "reason, which every stopped program reports"
     stop.add_argument("--reason", default="stopped by the operator", metavar="TEXT", help=about)
 
     clear = command("clear", operating.clear_command, "end an emergency stop, when it is safe to move")
-    file_option(clear, "--rig", "rig.toml", required=True)
+    _add_file(clear, "--rig", "rig.toml", required=True)
 
     about = "let the pan-tilt head find its limits; it turns through its whole range"
     reset_head = command("reset-head", operating.reset_head_command, about)
-    file_option(reset_head, "--rig", "rig.toml", required=True)
+    _add_file(reset_head, "--rig", "rig.toml", required=True)
     reset_head.add_argument("--yes", action="store_true", help="confirm that camera and cables are clear of it")
 
     about = "put a simulated rig behind the real devices' protocols, in real time"
     emulate = command("emulate", operating.emulate_command, about)
-    file_option(emulate, "--rig", "rig.toml of the simulated rig (the default rig)")
-    file_option(emulate, "--write", "rig.toml to write, which connects to it", required=True)
+    _add_file(emulate, "--rig", "rig.toml of the simulated rig (the default rig)")
+    _add_file(emulate, "--write", "rig.toml to write, which connects to it", required=True)
     emulate.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
     for name in ("head", "fixed", "zoom", "board", "control"):
         emulate.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
@@ -291,35 +292,38 @@ def make_parser() -> argparse.ArgumentParser:
     emulate.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
     emulate.make_epilog = operating.fault_names
 
+
+def _add_inspection(command: Command) -> None:
+    """Add view, detect, board and doctor."""
     about = "show the simulated scene, both cameras' frusta and their images"
     view = command("view", running.view_command, about)
-    file_option(view, "--rig", "rig.toml of the simulated rig (the default rig)")
+    _add_file(view, "--rig", "rig.toml of the simulated rig (the default rig)")
     view.add_argument("--target", metavar="NAME", help="follow this target of rig.toml")
-    file_option(view, "--calibration", "calibration.json (the simulation's true calibration)")
-    insist(view)
+    _add_file(view, "--calibration", "calibration.json (the simulation's true calibration)")
+    _add_insist(view)
     view.add_argument("--browser", action="store_true", help="serve a page for a web browser on this machine")
     view.add_argument("--port", type=port, metavar="P", help=f"port of the page; 0: any free one ({running.PORT})")
     view.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")
 
     detect = command("detect", running.detect_command, "run the fixed camera's detector and tracker on any video")
-    file_option(detect, "film", "video to search", "VIDEO")
+    _add_file(detect, "film", "video to search", "VIDEO")
     about = "a target of rig.toml, or one of book, person, bird"
     detect.add_argument("--target", required=True, metavar="NAME", help=about)
     about = (
         "write one line per confirmed track and frame, to stdout with -: u_px and v_px are the box's centre, the score "
         "is 0 where the box is only predicted"
     )
-    file_option(detect, "--csv", about, required=True)
-    file_option(detect, "--video", "write the video with the tracks drawn (.mp4)", "OUT")
-    file_option(detect, "--rig", "rig.toml, for targets of your own")
+    _add_file(detect, "--csv", about, required=True)
+    _add_file(detect, "--video", "write the video with the tracks drawn (.mp4)", "OUT")
+    _add_file(detect, "--rig", "rig.toml, for targets of your own")
     about = (
         "score the tracks by these boxes: a csv with frame,x_px,y_px,width_px,height_px, all from 0; x and y are of "
         "the box's top-left pixel"
     )
-    file_option(detect, "--labels", about)
+    _add_file(detect, "--labels", about)
 
     board = command("board", calibrating.board_command, "write a calibration board to print, to scale")
-    file_option(board, "--out", "file to write: .pdf, .svg or .png", required=True)
+    _add_file(board, "--out", "file to write: .pdf, .svg or .png", required=True)
     about = "kind of board; charuco has markers (chessboard)"
     board.add_argument("--kind", choices=KINDS, default=KINDS[0], help=about)
     board.add_argument("--board", type=board_corners, default=(9, 6), metavar="CxR", help="inner corners (9x6)")
@@ -327,5 +331,20 @@ def make_parser() -> argparse.ArgumentParser:
 
     about = "check versions, rendering and devices, and print the command that fixes what is missing"
     doctor = command("doctor", running.doctor_command, about)
-    file_option(doctor, "--rig", "rig.toml: check its devices too, without moving them")
-    return parser
+    _add_file(doctor, "--rig", "rig.toml: check its devices too, without moving them")
+
+
+def _add_file(parser: Parser, name: str, about: str, metavar: str = "FILE", **more: Any) -> None:
+    """Add an option or argument that names a file or folder."""
+    parser.add_argument(name, type=Path, metavar=metavar, help=about, **more)
+
+
+def _add_outputs(parser: Parser) -> None:
+    """Add the options of a run's table and video."""
+    _add_file(parser, "--csv", "write one line a step; -: to stdout")
+    _add_file(parser, "--video", "write a side-by-side video (.mp4)")
+
+
+def _add_insist(parser: Parser) -> None:
+    """Add the option that accepts implausible values."""
+    parser.add_argument("--insist", action="store_true", help="accept what is far outside of anything plausible")
