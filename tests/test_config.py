@@ -2,12 +2,13 @@
 
 import re
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cotarget.backends import check, load_config
-from cotarget.config import SimEffects, parse_config
+from cotarget.config import SimEffects, config_of, parse_config
 from cotarget.errors import ConfigError
 
 DOG = "[targets.dog]\nsize = 0.6\ndimension = 'height'\nwanted_px = 200\ndetector = 'motion'\n"
@@ -132,11 +133,29 @@ def test_a_missing_file_is_named(tmp_path):
         load_config(tmp_path)
 
 
-def test_scene_beside_rig_toml_is_found(tmp_path, monkeypatch):
+def test_paths_are_relative_to_rig_toml(tmp_path):
     (tmp_path / "own.xml").write_text("<mujoco/>")
-    (tmp_path / "rig.toml").write_text('[sim]\nscene = "own.xml"\n')
-    monkeypatch.chdir("/")
-    assert load_config(tmp_path / "rig.toml").sim.scene == str(tmp_path / "own.xml")
+    text = """
+        recording = "run"
+        [sim]
+        scene = "own.xml"
+        models.dog = "dog.obj"
+        [targets.book]
+        template = "/covers/mine.png"
+        [targets.dog]
+        size = 0.6
+        dimension = "height"
+        wanted_px = 200
+        detector = "colour"
+        template = "dog.png"
+        """
+    config = config_of(text, tmp_path / "rig.toml")
+    assert config.sim.scene == str(tmp_path / "own.xml")
+    assert (config.recording, config.sim.models["dog"]) == (tmp_path / "run", tmp_path / "dog.obj")
+    assert (config.targets["dog"].template, config.targets["book"].template) == (
+        tmp_path / "dog.png",
+        Path("/covers/mine.png"),
+    )
 
 
 def test_zoom_curves_are_checked_only_with_the_optics_effect():
