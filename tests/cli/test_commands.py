@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import cotarget
-from cotarget.calibration import draw_board, save_calibration
+from cotarget.calibration import Options, draw_board, save_calibration
 from cotarget.config import BoardConfig, RigConfig
+from cotarget.errors import CalibrationError
 from cotarget.geometry import pose
 from experiments.calibration.synthetic.rig import NOMINAL_PX, Truth, undistorted
 from tests.support.commands import OLD, bird_film, call, capture, refused, true_calibration, write_index
@@ -203,6 +204,23 @@ def test_calibrate_takes_photos_of_a_charuco_board(folder, capsys):
     assert printed["fixed_views"] == printed["zoom_views"] == 8
     assert printed["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
     assert json.loads((folder / "new.json").read_text())["board"]["kind"] == "charuco"
+
+
+@pytest.mark.parametrize(("more", "options"), [
+    ((), Options()), (("--encoders",), Options(encoders=True)), (("--insist",), Options(regularize=True)),
+    (("--method", "sequential"), Options("sequential")),
+])  # fmt: skip
+def test_calibrate_passes_the_options_of_the_fit(folder, capsys, monkeypatch, more, options):
+    asked = []
+
+    def calibrate(directory, options, progress):
+        asked.append(options)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("cotarget.calibration.calibrate_captures", calibrate)
+    write_index(folder / "photos", [])
+    assert refused(capsys, *FROM, "photos", *more) == "cotarget calibrate: enough"
+    assert asked == [options]
 
 
 @pytest.fixture(scope="module")
