@@ -123,11 +123,8 @@ def test_refused_session_does_not_offer_earlier_captures(folder, capsys, session
     assert "--from" not in refused(capsys, *CALIBRATE)
 
 
-@pytest.mark.parametrize(("stops", "taken", "said"), [
-    (None, 8, None), (1, 1, None), (2, 4, "2 zoom samples are 12 times apart"),
-    (3, 4, "3 zoom samples are 3.5 times apart"), (4, 4, None), (9, 9, None),
-])  # fmt: skip
-def test_zoom_samples_too_far_apart_get_others_between_them(capsys, caplog, monkeypatch, sessions, stops, taken, said):
+@pytest.mark.parametrize(("stops", "taken"), [(None, 8), (1, 1), (2, 4), (3, 4), (4, 4), (9, 9)])
+def test_zoom_samples_too_far_apart_get_others_between_them(capsys, caplog, monkeypatch, sessions, stops, taken):
     """Neighbours differ by a factor of at most 2.5: from 1 to 12, three steps by 2.29."""
     asked = {}
 
@@ -138,7 +135,7 @@ def test_zoom_samples_too_far_apart_get_others_between_them(capsys, caplog, monk
     monkeypatch.setattr("cotarget.calibration.calibrate.capture_session", session)
     call(capsys, "calibrate", "--rig", "rig.toml", *([] if stops is None else ["--stops", stops]))
     assert asked["stops"] == taken
-    assert [message[: len(said)] for message in caplog.messages] == [said] if said else not caplog.messages
+    assert [message.partition(":")[0] for message in caplog.messages] == ["stops"] * (stops in (2, 3))
 
 
 @pytest.mark.parametrize("options", [["--placements", "1"], ["--placements", "6", "--stops", "1"]])
