@@ -9,6 +9,7 @@ import logging
 import math
 import socket
 import threading
+from concurrent.futures import Future
 from dataclasses import replace
 
 import cv2
@@ -525,6 +526,15 @@ def test_a_lens_error_lasts_until_the_next_command(monkeypatch):
         camera.zoom(1000.0)
         wait_for(lambda: not camera.state().moving)
         assert len(link.commands("zoom")) == 3
+
+
+def test_a_still_is_dated_in_the_middle_of_the_call_that_takes_it():
+    """It takes 1 s; its transfer afterwards does not count."""
+    bench = Bench()
+    bench.camera.take.update(shoot=1.0, fetch=0.5)
+    begin, bench.shared.still = bench.clock.t, (still := Future())
+    bench.run(0.01)
+    assert still.result(0.0).t == pytest.approx(begin + 0.5, abs=CALL_S)
 
 
 def test_stills_of_another_size_say_what_to_write():
