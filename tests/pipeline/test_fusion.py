@@ -152,8 +152,9 @@ def crossing_persons(t, speed=1.5, depth=10.0):
 class Finder:
     """Finder that returns the true point inside a gate and logs its calls."""
 
-    def __init__(self, x_fixed=X, body_sigma_px=1.0, gate=math.inf):
+    def __init__(self, x_fixed=X, body_sigma_px=1.0, gate=math.inf, bias=(0.0, 0.0)):
         self.x, self.body_sigma_px, self.gate = np.array(x_fixed), body_sigma_px, gate
+        self.off_px = ZOOMED * np.array([-bias[0], bias[1]])  # of a head that points farther right and up
         self.shown, self.asked = {}, []
 
     def update_fixed(self, frame, detection, mask):
@@ -170,7 +171,8 @@ class Finder:
         )
         if (center - there) @ np.linalg.solve(expected.covariance, center - there) > self.gate:
             return None
-        return ZoomMeasurement(center, 1.0, np.full(2, self.body_sigma_px), 1.0, 1.0, np.ones(2), frame.t)
+        body_sigma_px = np.full(2, self.body_sigma_px)
+        return ZoomMeasurement(center + self.off_px, 1.0, body_sigma_px, 1.0, 1.0, np.ones(2), frame.t)
 
 
 def test_two_targets_that_cross_are_predicted_through_their_shared_box():
@@ -211,6 +213,17 @@ def test_a_larger_shared_box_moves_the_estimate_less():
         return FOCAL * fusion.estimate(1, t).x_fixed[0] / 10.0
 
     assert 0 < pulled(100.0) < pulled(40.0) < 1.0
+
+
+def test_a_box_of_a_part_of_the_target_measures_no_size():
+    fusion = TargetFusion(CALIBRATION, PERSON, SIZE)
+    whole = Detection(np.array(CENTER), np.array([28.0, 122.5]), 1.0)
+    t = seen(fusion, lambda t: [track(1, whole, t)], 25)
+    part = replace(whole, size_px=np.array([28.0, 61.0]))
+    for _ in range(10):
+        t += FRAME_S
+        show(fusion, t, [replace(track(1, whole, t), box=part)])
+    assert fusion.estimate(1, t).depth == pytest.approx(10.0, rel=DEPTH)
 
 
 # ---------------------------------------------------------------- candidates for selection
@@ -265,8 +278,11 @@ def test_a_target_is_seen_well_inside_the_close_up_and_as_large_as_wanted(pan, n
 
 
 # ---------------------------------------------------------------- the followed target in the zoom image
-def followed(finder, x_fixed=X, wrong=1.0, frames=40, **how):
-    """Follow a standing book, whose box is `wrong` times too large, with a given finder."""
+def followed(finder, x_fixed=X, wrong=1.0, frames=40, shake=0.0, **how):
+    """Follow a standing book, whose box is `wrong` times too large, with a given finder.
+
+    The head points straight ahead at each frame, and `shake` [rad] to the left between two frames.
+    """
     fusion = TargetFusion(CALIBRATION, BOOK, SIZE, **how)
     fusion.follow(1)
     fusion.search.finder = finder
@@ -274,6 +290,7 @@ def followed(finder, x_fixed=X, wrong=1.0, frames=40, **how):
     for i in range(frames):
         t = i * FRAME_S
         show(fusion, t, [track(1, box_at(*x_fixed, wrong=wrong), t)])
+        report(fusion, t - FRAME_S / 2, pan=-shake)
         report(fusion, t)
         found.append(fusion.update_zoom(Frame(IMAGE, t), t))
     return fusion, found, t
@@ -292,14 +309,21 @@ def test_the_zoom_image_triangulates_the_depth():
     assert finder.asked[-1].x_fixed[2] == pytest.approx(10.0, rel=DEPTH)
 
 
-def test_a_point_that_may_not_be_the_bodys_centre_moves_the_estimate_less():
-    """Wings and limbs move the point that both images show away from the centre."""
+@pytest.mark.parametrize(("body_sigma_px", "shake"), [(30.0, 0.0), (1.0, 0.05)], ids=["moving limbs", "moving head"])
+def test_an_uncertain_centre_in_the_zoom_image_moves_the_estimate_less(body_sigma_px, shake):
     off = np.add(X, (0.02, 0.0, 0.0))
-    pulled = [
-        fusion.estimate(1, t).x_fixed[0] - X[0]
-        for fusion, _, t in (followed(Finder(off, sigma), frames=10) for sigma in (30.0, 1.0))
-    ]
-    assert pulled[0] < 0.7 * pulled[1]
+    certain, _, t = followed(Finder(off), frames=10)
+    uncertain, _, _ = followed(Finder(off, body_sigma_px), frames=10, shake=shake)
+    assert uncertain.estimate(1, t).x_fixed[0] - X[0] < 0.7 * (certain.estimate(1, t).x_fixed[0] - X[0])
+
+
+def test_the_zoom_image_is_searched_at_the_heads_angles_plus_their_bias():
+    """The size of a book and the depth that it gives are known well enough to find most of the bias."""
+    bias = 1e-3, 1.5e-3
+    fusion, _, t = followed(finder := Finder(bias=bias))
+    asked = finder.asked[-1].pan, finder.asked[-1].tilt
+    np.testing.assert_allclose(fusion.estimate(1, t).bias, bias, rtol=0.5)
+    np.testing.assert_allclose(asked, bias, rtol=0.5)
 
 
 def test_the_zoom_image_is_not_searched_without_a_target_and_a_pose():
@@ -430,3 +454,12 @@ def test_zoom_frames_without_a_fixed_frame_of_their_time_cause_no_warning():
     assert len(fusion.search.finder.asked) <= 4 * (2 * MatchingSettings.longest_apart_s / FRAME_S + 1)
     assert len(fusion.search.waiting) <= MatchingSettings.latest_s / FRAME_S + 1
     assert warnings == []
+
+
+def test_few_zoom_frames_wait_for_a_fixed_camera_that_stops():
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion.follow(1)
+    fusion.search.finder = Ahead()
+    for i in range(100):
+        assert fusion.update_zoom(Frame(IMAGE, i * FRAME_S), 0.0) is None
+    assert len(fusion.search.waiting) <= MatchingSettings.latest_s / FRAME_S + 1
