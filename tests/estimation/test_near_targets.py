@@ -121,6 +121,14 @@ def test_a_clipped_box_is_an_upper_bound_of_the_depth():
     assert abs(math.log(found.depth / depth)) < 4 * math.sqrt(found.state_covariance[2, 2]) < 0.5
 
 
+def test_the_centre_of_a_clipped_box_is_uncertain_by_half_its_sides():
+    calibration, size = calibration_of(Truth()), np.array([31.0, 120.0])
+    estimator = TargetFilter(calibration, DEFAULT_TARGETS["person"])
+    estimator.update_fixed(Detection(np.array(calibration.fixed.lens.image_center_px), size, 1.0, clipped=True), 0.0)
+    sigma = np.sqrt(np.diag(estimator.at(0.0).state_covariance)[:2])
+    np.testing.assert_allclose(sigma * [Truth().fixed.fx, Truth().fixed.fy], size / 2, rtol=0.05)
+
+
 def test_a_target_that_flies_at_the_camera_keeps_a_positive_depth():
     calibration = calibration_of(Truth())
     estimator, near = TargetFilter(calibration, DEFAULT_TARGETS["bird"]), calibration.fixed.lens.image_center_px
