@@ -18,7 +18,8 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import TargetProfile, split_name
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, UnreachableError
-from cotarget.estimation.zoom_matching import GATE, CloseupFinder, Expected, ZoomMeasurement
+from cotarget.estimation.motion_model import GATE
+from cotarget.estimation.zoom_matching import CloseupFinder, Expected, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.pantilt import HeadGeometry

@@ -20,15 +20,8 @@ from cotarget.control.selection import Candidate, leaves_in
 from cotarget.control.zoom import is_seen_well, shape_of
 from cotarget.detection import Detection
 from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
-from cotarget.estimation.motion_model import PAN, TILT, K, L
-from cotarget.estimation.zoom_matching import (
-    GATE,
-    CloseupFinder,
-    Expected,
-    Finder,
-    MatchingSettings,
-    ZoomMeasurement,
-)
+from cotarget.estimation.motion_model import GATE, HEAD_SIGMA, PAN, TILT, K, L
+from cotarget.estimation.zoom_matching import CloseupFinder, Expected, Finder, MatchingSettings, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.pantilt import towards
 from cotarget.rig import Frame, Image, PanTiltState, ZoomState
@@ -384,7 +377,7 @@ class TargetFusion:
             # Both cameras show the same point, but wings and limbs move it. With the registration's own error alone,
             # the filter would take their beats for motion of the target.
             sigma_px = np.hypot(found.sigma_px, found.body_sigma_px)
-            head_sigma = math.hypot(self._filter_settings.head_sigma, pose.speed * self._settings.time_sigma_s)
+            head_sigma = math.hypot(HEAD_SIGMA, pose.speed * self._settings.time_sigma_s)
             known.update_zoom(
                 found.center_px, sigma_px, pose.pan, pose.tilt, pose.nominal_px, due.t, head_sigma=head_sigma
             )

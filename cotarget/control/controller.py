@@ -16,7 +16,7 @@ from cotarget.control.head import HeadController, HeadSettings
 from cotarget.control.zoom import ZoomController, ZoomSettings, expect
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
-from cotarget.rig import Angles, PanTiltState, Rig
+from cotarget.rig import PanTiltState, Rig
 from cotarget.targeting import Aim, Reach, aim
 
 NO_CHANGE = 1e-6  # least change of the logarithm of the focal length that is commanded
@@ -47,14 +47,12 @@ class _Course:
         target: estimate of the target at that time.
         first: aim at it.
         then: aim one frame later, at the same focal length.
-        goal_sigmas: standard deviations of the next goal's pan and tilt, for a target carried by hand [rad].
     """
 
     effect_t: float
     target: Estimate
     first: Aim
     then: Aim
-    goal_sigmas: Angles
 
 
 class Controller:
@@ -78,7 +76,7 @@ class Controller:
         predict: bool = True,
     ) -> None:
         head = head or HeadSettings()
-        self._rig, self._calibration, self._ahead_s, self._predict = rig, calibration, head.ahead_s, predict
+        self._rig, self._calibration, self._predict = rig, calibration, predict
         shortest, longest = (self._true(nominal) for nominal in rig.zoom.focal_range)
         self._zoom = ZoomController((shortest, longest), rig.zoom.size, zoom or ZoomSettings())
         self._head_controller = HeadController(rig.head.limits, head)
@@ -154,9 +152,7 @@ class Controller:
         self._head_controller.head.correct(state)  # a halted or slow head is not where it was sent
         reach = reach_of(self._rig, state)
         first = self._aim(at_effect, reach)
-        later = predict(effect + self._ahead_s) if at_effect.carried else None
-        goal_sigmas = (0.0, 0.0) if later is None else goal_sigmas_of(later, first)
-        return _Course(effect, at_effect, first, self._aim(then, reach, first), goal_sigmas)
+        return _Course(effect, at_effect, first, self._aim(then, reach, first))
 
     def _command_head(self, course: _Course, interval: float) -> None:
         """Send the head unless it is held."""
@@ -170,7 +166,6 @@ class Controller:
             rates,
             self._rig.zoom.size[0] / self._true(focal),
             effect - course.target.measured_t,
-            course.goal_sigmas,
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
@@ -207,15 +202,6 @@ class Controller:
         pan = min(max(pan, reach.pan[0]), reach.pan[1])
         tilt = min(max(tilt, reach.tilt[0]), reach.tilt[1])
         return dataclasses.replace(found, pan=pan, tilt=tilt)
-
-
-def goal_sigmas_of(target: Estimate, aimed: Aim) -> Angles:
-    """Standard deviations of the pan and tilt at a target, near an aim [rad]; 0 if it is behind the camera."""
-    seen = target.appearance(aimed.pan, aimed.tilt, aimed.nominal_px)
-    if seen is None:
-        return 0.0, 0.0
-    across, along = (seen.sigma_px / seen.focal_px).tolist()
-    return across / math.cos(aimed.tilt), along
 
 
 def reach_of(rig: Rig, state: PanTiltState | None = None) -> Reach:

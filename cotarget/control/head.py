@@ -44,8 +44,6 @@ class HeadSettings:
         nearer: a distant axis approaches its goal if it will be within this part of its present distance.
         slow_lead: part of the lead removed from an axis that is slow while the other turns. With the whole lead the
             head nods with the noise of the speed, without any it lags behind a target that moves slightly aslant.
-        turn_sigmas: while a target is carried by hand, an axis reverses only for more than this many standard
-            deviations of its goal.
         steps_off: a report agrees with the model of the head within this many steps ...
         time_off_s: ... plus the angle that the axis turns in this time [s].
         reports_s: longest time between two reports from which the speed is computed, after the head contradicts the
@@ -67,7 +65,6 @@ class HeadSettings:
     fine_steps: float = 0.6
     nearer: float = 0.2
     slow_lead: float = 0.5
-    turn_sigmas: float = 0.5
     steps_off: float = 2.0
     time_off_s: float = 0.01
     reports_s: float = 0.3
@@ -257,7 +254,6 @@ class HeadController:
         self._limits = limits
         self._settings = settings
         self.head = HeadModel(limits, settings)
-        self._turning = (0.0, 0.0)  # sign of the last change of each goal
 
     def decide(
         self,
@@ -267,7 +263,6 @@ class HeadController:
         rates: Angles,
         field: float,
         lead_s: float = 0.0,
-        goal_sigmas: Angles = (0.0, 0.0),
     ) -> HeadCommand | None:
         """Decide on a command for the head.
 
@@ -278,7 +273,6 @@ class HeadController:
             rates: rates of these [rad/s].
             field: horizontal angle of view [rad].
             lead_s: time from the last measurement to ``effect_t`` [s]; a slow axis does not lead by all of it.
-            goal_sigmas: standard deviations of pan and tilt ``ahead_s`` later, for a target carried by hand [rad].
 
         Returns:
             The command; None if the head is best left alone.
@@ -299,9 +293,8 @@ class HeadController:
             catch_s = self._settings.hurry_s if off > self._settings.far * zone else self._settings.catch_s
             command = self._follow_reference(effect_t, interval_s, reference, catch_s)
             if self._settings.deadband and not reference.still:
-                command = self._hold_slow_axes(command, reference, resting, goal_sigmas)
+                command = self._hold_slow_axes(command, reference, resting)
         command = self._clipped(command)
-        self._note_turns(command)
         self.head.add_command(effect_t, command)
         return command
 
@@ -371,33 +364,23 @@ class HeadController:
             speeds.append(max(abs(v), LEAST_SPEED))
         return HeadCommand(goals[0], goals[1], (speeds[0], speeds[1]))
 
-    def _hold_slow_axes(
-        self, command: HeadCommand, reference: _Reference, resting: Sequence[bool], goal_sigmas: Angles
-    ) -> HeadCommand:
+    def _hold_slow_axes(self, command: HeadCommand, reference: _Reference, resting: Sequence[bool]) -> HeadCommand:
         """Keep the last goal and speed of an axis that is slow and near enough.
 
         A person who walks by stays at one height. If tilt were commanded as often as pan has to be, it would go up and
-        down with every error of the estimate. A target carried by hand is equally uncertain along both axes.
+        down with every error of the estimate.
         """
         last = self.head.command
         if last is None:
             return command
-        olds, news = self._axes(last), self._axes(command)
-        kept = []
-        for i in range(2):
-            turn = news[i][0] - olds[i][0]
-            back = turn * self._turning[i] < 0 and abs(turn) <= self._settings.turn_sigmas * goal_sigmas[i]
-            kept.append(olds[i] if back or (reference.slow[i] and resting[i]) else news[i])
+        kept = [
+            old if slow and rests else new
+            for old, new, slow, rests in zip(
+                self._axes(last), self._axes(command), reference.slow, resting, strict=True
+            )
+        ]
         (pan, pan_speed), (tilt, tilt_speed) = kept
         return HeadCommand(pan, tilt, (pan_speed, tilt_speed))
-
-    def _note_turns(self, command: HeadCommand) -> None:
-        """Store the direction in which each goal has changed last."""
-        last = self.head.command
-        if last is not None:
-            turns = command.pan - last.pan, command.tilt - last.tilt
-            pan, tilt = (math.copysign(1.0, new) if new else old for new, old in zip(turns, self._turning, strict=True))
-            self._turning = pan, tilt
 
     def _axes(self, command: HeadCommand) -> Motion:
         """Goal and speed of each axis of a command."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
-from cotarget.estimation.motion_model import PAN, SEEN, STATES, TILT, A, B, G, K, L
+from cotarget.estimation.motion_model import OF_SIZE, PAN, SEEN, TILT, A, B, G, K, L, MotionSettings
 from cotarget.geometry import Array
 from cotarget.pantilt import HeadGeometry
 from cotarget.targeting import WantedSize
@@ -95,9 +95,6 @@ class SightLines:
 
 
 _SEEN_TWICE = np.ix_(SEEN, SEEN)
-# Derivative of the logarithm of the apparent size, k + g - l, by the state.
-_BY_SIZE = np.zeros(STATES)
-_BY_SIZE[[L, K, G]] = -1.0, 1.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -133,9 +130,7 @@ class Estimate:
         measured_t: time of the newest measurement before it [s].
         state: state, see `cotarget.estimation.motion_model`, (13,).
         state_covariance: covariance of the state, (13, 13).
-        carried: whether the target jumped recently and may be carried by hand.
-        size_prior: standard deviation of the size's prior, relative.
-        bias_prior: standard deviation of the head bias's prior, per axis [rad].
+        motion: motion of the target, with the priors of its size and of the head's bias.
         target: target profile.
         calibration: calibration of the rig.
         sight_lines: sight lines of that calibration.
@@ -145,9 +140,7 @@ class Estimate:
     measured_t: float
     state: Array
     state_covariance: Array
-    carried: bool
-    size_prior: float
-    bias_prior: float
+    motion: MotionSettings
     target: TargetProfile
     calibration: Calibration
     sight_lines: SightLines
@@ -176,12 +169,12 @@ class Estimate:
     @property
     def size_deviation(self) -> float:
         """Deviation of the true size from the nominal one, in prior standard deviations."""
-        return float(self.state[K]) / self.size_prior
+        return float(self.state[K]) / self.motion.size_sigma
 
     @property
     def bias_deviation(self) -> float:
         """Magnitude of the head's bias, in prior standard deviations; above 4, calibrate again."""
-        return math.hypot(*self.bias) / self.bias_prior
+        return math.hypot(*self.bias) / self.motion.bias_sigma
 
     @property
     def wanted_size(self) -> WantedSize:
@@ -213,6 +206,6 @@ class Estimate:
             offset_px=focal * tangent + np.array(lens.center_px) - lens.image_center_px,
             covariance=J @ P[_SEEN_TWICE] @ J.T,
             size_px=size * float(focal[int(self.target.is_vertical())]),
-            size_sigma=math.sqrt(max(float(_BY_SIZE @ P @ _BY_SIZE), 0.0)),
+            size_sigma=math.sqrt(max(float(OF_SIZE @ P @ OF_SIZE), 0.0)),
             focal_px=focal,
         )

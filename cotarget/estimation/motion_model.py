@@ -19,7 +19,7 @@ motion models and the choice of the numbers: docs/design-notes.md.
 import functools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,32 +28,16 @@ from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.config import TargetProfile
 from cotarget.geometry import Array
 
-# Bias left by the head's rounding and play and by the centre of a box, whatever the calibration says [rad].
-LEAST_BIAS = 5e-4
-# Bias of a rig whose calibration does not say how good it is: 0.04 degrees [rad].
-USUAL_BIAS = 7e-4
-# Least depth, in sizes of the target. Nearer, it spans more than a right angle, fills the view of any likely fixed
-# camera, and pointing at it is no use.
+# Standard deviation of a reported angle of the head: what rounding to steps of 0.05 degrees leaves [rad].
+HEAD_SIGMA = 3e-4
+# Least depth, in sizes of the target. Nearer, it spans more than a right angle, and pointing at it is no use.
 NEAREST_SIZES = 0.5
+# Bound of the search in the zoom image, and gate on the normalised innovation squared (NIS) of a size: three standard
+# deviations.
+GATE = 3.0**2
+# Gate on the NIS of a centre: 99.9 % of a chi-square with two degrees of freedom.
+CENTER_GATE = 13.8
 USUAL_DEPTH = 15.0  # initial depth of a target without a measured size [m]
-
-
-@dataclass(frozen=True)
-class Jump:
-    """Motion of a target after it was found where it could not be: it was carried there, or was mistaken.
-
-    Attributes:
-        speed: standard deviation of the velocity after a jump, across the line of sight [m/s].
-        acceleration: standard deviation of the acceleration after a jump, across the line of sight [m/s^2].
-        seconds: how long this motion lasts; a hand that carries something speeds up and brakes meanwhile [s].
-        by_hand_s: time constant of the acceleration meanwhile, of targets carried by hand [s]; None for targets that
-            move by themselves, whose time constant stays.
-    """
-
-    speed: float = 3.0
-    acceleration: float = 10.0
-    seconds: float = 1.5
-    by_hand_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -62,8 +46,8 @@ class MotionSettings:
 
     Attributes:
         acceleration: standard deviation of the acceleration along each axis [m/s^2].
-        manoeuvre_s: time constant of the acceleration [s]. Much less than a frame's time makes the velocity a random
-            walk; much more makes the acceleration constant.
+        manoeuvre_s: time constant of the acceleration [s]. Much less than a frame's time makes the velocity a
+            random walk; much more makes the acceleration constant.
         speed: standard deviation of the velocity along each axis [m/s].
         size_sigma: standard deviation of k, the logarithm of the true size over the nominal one.
         attitude_mean: mean of g, the logarithm of the apparent size over the true one; negative if foreshortened.
@@ -72,7 +56,6 @@ class MotionSettings:
         bias_sigma: standard deviation of the head's bias, in pan and tilt each [rad].
         bias_s: time constant of that bias [s].
         nearest: least depth of a target, along the fixed camera's axis [m].
-        jump: motion after the target was found where it could not be.
     """
 
     acceleration: float
@@ -82,10 +65,9 @@ class MotionSettings:
     attitude_mean: float = 0.0
     attitude_sigma: float = 0.02
     attitude_s: float = 0.5
-    bias_sigma: float = USUAL_BIAS
+    bias_sigma: float = 7e-4
     bias_s: float = 60.0
     nearest: float = 0.1
-    jump: Jump = field(default_factory=Jump)
 
     @property
     def fading_s(self) -> float:
@@ -101,31 +83,21 @@ class FilterSettings:
         motion: motion of the target.
         noise_px: standard deviation of a box's centre in the fixed image, the part independent of its size [px].
         noise_of_size: the part proportional to the box's side, from moving limbs and wings.
-        noise_s: how long an error of that centre lasts [s].
-        size_noise: relative standard deviation of a box's side.
-        size_noise_px: standard deviation of a box's side, the part independent of its size [px].
-        size_s: how long an error of the side lasts, half a wing beat or step [s].
+        noise_s: how long an error of a centre lasts [s].
+        side_px: standard deviation of a box's side, the part independent of its size [px].
+        side_of_size: the part proportional to the side.
+        size_s: how long an error of a side lasts, half a wing beat or step [s].
         unsized_s: time constant of the velocity along the axis while the fixed camera shows only a part of the target:
             long enough for a moment behind a post; a target that fills the view has mostly stopped [s].
-        head_sigma: standard deviation of the angles reported for a frame; rounding of 0.05 degrees leaves that [rad].
-        gate: gate on the NIS of a centre, 99.9 % of a chi-square with two degrees of freedom; beyond it, a measurement
-            counts less.
-        jump_gate: beyond this NIS, ten standard deviations, a measurement is wrong or the target is elsewhere.
-        size_gate: gate on the NIS of a size, 99.7 % of a chi-square with one degree of freedom.
-        misses: measurements in a row beyond their gate after which they are believed.
-        zoom_misses: rejected zoom measurements in a row, while the fixed camera is consistent, after which size and
-            head bias are inflated.
-        consistent_nis: mean NIS below which the fixed camera counts as consistent.
-        mean_innovation_gain: weight of the newest innovation in the mean innovation of the zoom camera.
-        most_mean_innovation: mean innovation, in standard deviations, beyond which size and head bias are inflated;
-            for white noise it is 0.23 along each axis.
         depth_sigma: standard deviation of the logarithm of the depth, before a size is measured.
-        depth_inflation: standard deviation added to it after a jump, and to it and g after rejected sizes.
-        size_inflation: standard deviation added to the logarithms of size and depth together, after contradictions by
-            the zoom camera.
-        bias_inflation: standard deviation then added to the head's bias [rad].
-        nis_gain: weight of the newest measurement in the mean NIS.
-        most_noise_scale: largest factor on the variance of the acceleration.
+        jump_gate: beyond this NIS, ten standard deviations, a centre is wrong or the target is elsewhere.
+        misses: rejected measurements in a row after which they are believed.
+        zoom_misses: rejected zoom measurements in a row, while the fixed camera's are accepted, after which size and
+            head bias are inflated.
+        inflation: standard deviation added to the logarithms of depth, size and attitude that measurements contradict.
+        bias_inflation: standard deviation added to the head's bias that the zoom camera contradicts [rad].
+        nis_gain: weight of the newest measurement in the mean NIS, which scales the variance of the acceleration.
+        most_noise_scale: largest such factor; also that on the variance of the velocity after a jump.
         history_s: how late a measurement may arrive after the newest one [s].
     """
 
@@ -133,46 +105,25 @@ class FilterSettings:
     noise_px: float = 0.4
     noise_of_size: float = 0.04
     noise_s: float = 0.03
-    size_noise: float = 0.05
-    size_noise_px: float = 1.0
+    side_px: float = 1.0
+    side_of_size: float = 0.05
     size_s: float = 0.2
     unsized_s: float = 0.5
-    head_sigma: float = 3e-4
-    gate: float = 13.8
+    depth_sigma: float = 1.0
     jump_gate: float = 100.0
-    size_gate: float = 9.0
     misses: int = 3
     zoom_misses: int = 8
-    consistent_nis: float = 2.0
-    mean_innovation_gain: float = 0.1
-    most_mean_innovation: float = 1.0
-    depth_sigma: float = 1.0
-    depth_inflation: float = 0.3
-    size_inflation: float = 0.3
+    inflation: float = 0.3
     bias_inflation: float = 5e-3
     nis_gain: float = 0.2
     most_noise_scale: float = 30.0
     history_s: float = 1.5
 
-    @property
-    def jump_noise_scale(self) -> float:
-        """Least factor on the variance of the acceleration after a jump."""
-        return max(1.0, (self.motion.jump.acceleration / self.motion.acceleration) ** 2)
 
-    @functools.cached_property
-    def jump_motion(self) -> MotionSettings:
-        """Motion after a jump: time constants only, `jump_noise_scale` raises the acceleration."""
-        by_hand_s = self.motion.jump.by_hand_s
-        return self.motion if by_hand_s is None else replace(self.motion, manoeuvre_s=by_hand_s)
-
-
-# A hand that reaches for something speeds up and brakes within about a second.
-HAND = Jump(acceleration=5.0, seconds=1.25, by_hand_s=0.15)
-# Motion by the target profile's `motion`. A standing target may still be carried elsewhere. The larger side of what
-# flies varies from its body's length to its wingspan. Of a target of which nothing is known, motion and attitude lie
-# between a walking and a flying one's.
+# Motion by the target profile's `motion`. The larger side of what flies varies from its body's length to its wingspan.
+# Of a target of which nothing is known, motion and attitude lie between a walking and a flying one's.
 MOTIONS = {
-    "standing": MotionSettings(0.5, 0.5, 0.7, 0.01, attitude_sigma=0.01, attitude_s=2.0, jump=HAND),
+    "standing": MotionSettings(0.5, 0.5, 0.7, 0.01, attitude_sigma=0.01, attitude_s=2.0),
     "walking": MotionSettings(0.8, 0.7, 1.2, 0.04),
     "flying": MotionSettings(6.5, 2.5, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0),
     "general": MotionSettings(2.5, 1.0, 3.0, 0.075, attitude_sigma=0.2, attitude_s=1.0),
@@ -180,16 +131,9 @@ MOTIONS = {
 # Measurement noise that differs from the defaults, by the target profile's `matcher`. The errors of an outline last
 # half a wing beat, those of its size a quarter of one.
 NOISE: Mapping[str, Mapping[str, Any]] = {
-    "box": {
-        "noise_px": 0.2,
-        "noise_of_size": 0.01,
-        "noise_s": 0.0,
-        "size_noise": 0.01,
-        "size_noise_px": 0.3,
-        "misses": 2,
-    },
+    "box": {"noise_px": 0.2, "noise_of_size": 0.01, "noise_s": 0.0, "side_px": 0.3, "side_of_size": 0.01, "misses": 2},
     "upright": {},
-    "outline": {"noise_of_size": 0.06, "noise_s": 0.1, "size_noise": 0.1, "size_s": 0.06},
+    "outline": {"noise_of_size": 0.06, "noise_s": 0.1, "side_of_size": 0.1, "size_s": 0.06},
 }
 
 
@@ -205,27 +149,24 @@ def filter_settings(target: TargetProfile, calibration: Calibration | None = Non
         middle = calibration.fixed.lens.image_center_px
         sigma = float(predicted_pointing(calibration, middle, USUAL_DEPTH)) / math.sqrt(2)  # along one axis
         if np.isfinite(sigma):
-            motion = replace(motion, bias_sigma=math.hypot(LEAST_BIAS, sigma))
+            motion = replace(motion, bias_sigma=math.hypot(motion.bias_sigma, sigma))
     return FilterSettings(motion, **NOISE[target.matcher])
 
 
 STATES = 13
-MOVING = 9  # position, velocity and acceleration, (a, b, l, w, c); the other four drift
-A, B, L, K, G, PAN, TILT = 0, 1, 2, 9, 10, 11, 12
-W, C = slice(3, 6), slice(6, 9)
+A, B, L, WA, WB, WL, CA, CB, CL, K, G, PAN, TILT = range(STATES)
+W, C = slice(WA, CA), slice(CA, K)
+MOVING = slice(A, K)  # position, velocity and acceleration; the other four components drift
 SEEN = [A, B, L, PAN, TILT]  # components that a measurement in the zoom image depends on
-# Least ratio of new to old depth in one prediction, whatever the velocity is.
-NEAREST = 0.2
+OF_SIZE = np.zeros(STATES)  # derivative of a measured size, l - k - g, by the state
+OF_SIZE[[L, K, G]] = 1.0, -1.0, -1.0
 # Below this ratio of time step to time constant, Singer's noise is that of white jerk to better than 2 %, while its
 # closed form loses its digits.
 SHORT = 0.03
-_UNIT = np.eye(MOVING)
-MOST_UNCERTAINTY = 0.5  # largest variance of the logarithm of the depth that widens the noise
-# Largest standard deviations, however long nothing is measured: the target is anywhere in view, its depth is known to a
-# factor of some five, size and attitude to three, the head's bias to six degrees.
-MOST_SIGMA = np.array([3.0, 3.0, 1.5, *[1e2] * 3, *[1e3] * 3, 1.0, 1.0, 0.1, 0.1])
-_MOST_VARIANCE = MOST_SIGMA**2
-CACHED = 1024  # cached time steps; frames come at regular intervals
+# Largest variance of the logarithm of the depth that widens the noise.
+MOST_UNCERTAINTY = 0.5
+# Largest variance of the logarithm of the depth, before and however long after it is measured: a factor of some five.
+MOST_DEPTH_VARIANCE = 1.5**2
 
 
 @dataclass(frozen=True)
@@ -236,18 +177,16 @@ class Span:
         linear: linear motion before the division by the new depth, (13, 13).
         noise: covariance of position, velocity and acceleration for unit variance of the acceleration, (9, 9).
         drift: variances that attitude and bias gain, (13, 13).
-        dt: time step [s].
         reach: position gained per unit of acceleration [s^2].
     """
 
     linear: Array
     noise: Array
     drift: Array
-    dt: float
     reach: float
 
 
-@functools.lru_cache(maxsize=CACHED)
+@functools.lru_cache(maxsize=1024)  # frames come at regular intervals
 def span_of(dt: float, motion: MotionSettings) -> Span:
     """Compute the parts of a prediction over a time step ``dt`` > 0 [s]; cached."""
     tau = motion.manoeuvre_s
@@ -255,16 +194,15 @@ def span_of(dt: float, motion: MotionSettings) -> Span:
     gain = -tau * math.expm1(-dt / tau)
     reach = tau * (dt - gain)
     # An unmeasured depth must not run away: its velocity fades, so that its variance stays at the target's speed.
-    fade = math.exp(-dt / motion.fading_s)
-    attitude, bias = math.exp(-dt / motion.attitude_s), math.exp(-dt / motion.bias_s)
+    fade, attitude, bias = (math.exp(-dt / each) for each in (motion.fading_s, motion.attitude_s, motion.bias_s))
     linear = np.diag([*[1.0] * 5, fade, *[rho] * 3, 1.0, attitude, bias, bias])
     for i in range(3):
-        linear[i, 3 + i], linear[i, 6 + i], linear[3 + i, 6 + i] = dt, reach, gain
-    linear[5, 8] *= fade
-    growth = np.array([0.0, motion.attitude_sigma**2, motion.bias_sigma**2, motion.bias_sigma**2])
-    drift = np.zeros((STATES, STATES))
-    drift[range(MOVING, STATES), range(MOVING, STATES)] = growth * (1 - np.array([1.0, attitude, bias, bias]) ** 2)
-    return Span(linear, np.kron(_singer(dt, tau), np.eye(3)).astype(float), drift, dt, reach)
+        linear[i, WA + i], linear[i, CA + i], linear[WA + i, CA + i] = dt, reach, gain
+    linear[WL, CL] *= fade
+    sigmas = np.zeros(STATES)
+    sigmas[G:] = motion.attitude_sigma, motion.bias_sigma, motion.bias_sigma
+    drift = np.diag(sigmas**2 * (1 - linear.diagonal() ** 2))
+    return Span(linear, np.kron(_singer(dt, tau), np.eye(3)).astype(float), drift, reach)
 
 
 def _singer(dt: float, tau: float) -> Array:
@@ -301,39 +239,34 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale
     if dt <= 0:
         return x, P
     span = span_of(dt, motion)
-    closer = 1 + float(x[5]) * dt + float(x[8]) * span.reach  # new depth over old depth
-    ratio = max(closer, NEAREST, min(motion.nearest * math.exp(-x[L]), 1.0))
+    closer = 1 + float(x[WL]) * dt + float(x[CL]) * span.reach  # new depth over old depth
+    ratio = max(closer, min(motion.nearest * math.exp(-x[L]), 1.0))
     y = span.linear @ x
     log_depth = float(x[L]) + math.log(ratio)
-    y[:MOVING] /= ratio
+    y[MOVING] /= ratio
     y[L] = log_depth
     y[G] += motion.attitude_mean * (1 - span.linear[G, G])
-    if closer < ratio:  # nearer than possible, so the target has stopped
-        y[[5, 8]] = 0.0
     F = span.linear.copy()
-    F[:MOVING] /= ratio
+    F[MOVING] /= ratio
     F[L] = 0.0
     F[L, L] = 1.0
-    if closer >= ratio:
-        shrink = y[:MOVING] / ratio
+    if closer < ratio:  # nearer than possible, so the target has stopped
+        y[[WL, CL]] = 0.0
+    else:
+        shrink = y[MOVING] / ratio
         shrink[L] = -1 / ratio
-        F[:MOVING, 5] -= shrink * dt
-        F[:MOVING, 8] -= shrink * span.reach
+        F[MOVING, WL] -= shrink * dt
+        F[MOVING, CL] -= shrink * span.reach
     P = F @ P @ F.T + span.drift
     # Position noise along the axis scales everything that is divided by the depth.
-    N = _UNIT.copy()
-    N[:, L] -= y[:MOVING]
+    N = np.eye(K)
+    N[:, L] -= y[MOVING]
     N[L, L] = 1.0
     # The mean of 1 / depth^2 over the depth's distribution: an uncertain depth makes the noise larger.
     sigma = motion.acceleration * math.exp(min(P[L, L], MOST_UNCERTAINTY) - log_depth)
-    P[:MOVING, :MOVING] += N @ span.noise @ N.T * (noise_scale * sigma * sigma)
-    return y, _bounded(P)
-
-
-def _bounded(P: Array) -> Array:
-    """Scale variances down to their limits; correlations stay, so the result is still a covariance."""
-    variances = P.diagonal()
-    if (variances <= _MOST_VARIANCE).all():
-        return P
-    scale = np.sqrt(np.minimum(1.0, _MOST_VARIANCE / variances))
-    return P * np.outer(scale, scale)
+    P[MOVING, MOVING] += N @ span.noise @ N.T * (noise_scale * sigma * sigma)
+    if P[L, L] > MOST_DEPTH_VARIANCE:  # correlations stay, so the result is still a covariance
+        scale = math.sqrt(MOST_DEPTH_VARIANCE / P[L, L])
+        P[L] *= scale
+        P[:, L] *= scale
+    return y, P

@@ -10,7 +10,9 @@ by itself is as good as the calibration. Gates and inflations: docs/design-notes
 
 import bisect
 import math
+import operator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,17 +20,24 @@ from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.estimation.measurement_model import Estimate, SightLine, SightLines
 from cotarget.estimation.motion_model import (
+    CENTER_GATE,
+    CL,
+    GATE,
+    HEAD_SIGMA,
+    OF_SIZE,
     PAN,
     SEEN,
     STATES,
     TILT,
     USUAL_DEPTH,
+    WA,
+    WB,
+    WL,
     A,
     B,
     C,
     FilterSettings,
     G,
-    Jump,
     K,
     L,
     W,
@@ -37,8 +46,6 @@ from cotarget.estimation.motion_model import (
 )
 from cotarget.geometry import Array
 from cotarget.tracking.track import Measurement
-
-FARTHEST = 1e5  # largest depth of a target [m]
 
 
 @dataclass(frozen=True)
@@ -50,32 +57,22 @@ class Node:
         x: state, see `cotarget.estimation.motion_model`, (13,).
         P: covariance of the state, (13, 13).
         mean_nis: running mean of the normalised innovation squared per dimension, of centres in both images.
-        noise_scale: factor on the variance of the acceleration.
         rejected_fixed: centres in the fixed image rejected in a row.
         rejected_zoom: centres in the zoom image rejected in a row.
         rejected_size: sizes rejected in a row.
         size_t: time of the last size measurement [s].
         fixed_t: time of the last correction by a centre in the fixed image [s]; a start or restart is no correction.
-        jump_t: time of the last jump, when the target was found where it could not be [s].
-        mean_innovation: running mean of the innovation in the zoom image, in standard deviations along u and v, (2,).
     """
 
     t: float
     x: Array
     P: Array
     mean_nis: float = 1.0
-    noise_scale: float = 1.0
     rejected_fixed: int = 0
     rejected_zoom: int = 0
     rejected_size: int = 0
     size_t: float = -math.inf
     fixed_t: float = -math.inf
-    jump_t: float = -math.inf
-    mean_innovation: tuple[float, float] = (0.0, 0.0)
-
-    def jumped(self, jump: Jump) -> bool:
-        """Whether the last jump is so recent that the target may still be on its way."""
-        return self.t < self.jump_t + jump.seconds
 
 
 def sound(node: Node, nearest: float) -> Node | None:
@@ -88,15 +85,14 @@ def sound(node: Node, nearest: float) -> Node | None:
     x, P = node.x.copy(), (node.P + node.P.T) / 2
     if not (np.isfinite(x).all() and np.isfinite(P).all() and (P.diagonal() > 0).all()):
         return None
-    x[L] = min(max(x[L], math.log(nearest)), math.log(FARTHEST))
+    x[L] = max(x[L], math.log(nearest))
     return replace(node, x=x, P=P)
 
 
-# Corrections by measurements
-
-MOST_ITERATIONS = 4  # of an iterated correction
-LEAST_INTERVAL_S = 1e-3  # least time between two measurements, in the variance of repeated errors [s]
-CONVERGED = 1e-3  # the iteration ends when the logarithm of the depth changes by less
+# An iterated correction ends when the logarithm of the depth changes by less, or after so many iterations.
+CONVERGED, MOST_ITERATIONS = 1e-3, 4
+# Sort key of observations: time, and the fixed camera before the zoom camera.
+KEY = operator.attrgetter("t", "order")
 
 
 @dataclass(frozen=True)
@@ -122,11 +118,7 @@ class FixedObservation:
     tangent: Array
     R: Array
     size: SizeObservation | None
-
-    @property
-    def key(self) -> tuple[float, int]:
-        """Sort key: time, and the fixed camera before the zoom camera."""
-        return self.t, 0
+    order: ClassVar[int] = 0
 
 
 @dataclass(frozen=True)
@@ -137,11 +129,7 @@ class ZoomObservation:
     tangent: Array
     R: Array
     sight: SightLine
-
-    @property
-    def key(self) -> tuple[float, int]:
-        """Sort key: time, and the fixed camera before the zoom camera."""
-        return self.t, 1
+    order: ClassVar[int] = 1
 
 
 def begin(observed: FixedObservation, settings: FilterSettings) -> Node:
@@ -163,7 +151,7 @@ def begin(observed: FixedObservation, settings: FilterSettings) -> Node:
     sigma[[PAN, TILT]] = motion.bias_sigma
     P = np.diag(sigma**2)
     P[:2, :2] = observed.R
-    return _size(Node(observed.t, x, P), observed.size, settings)
+    return _correct_size(Node(observed.t, x, P), observed.size, settings)
 
 
 def correct_fixed(node: Node, observed: FixedObservation, settings: FilterSettings) -> Node:
@@ -177,54 +165,51 @@ def correct_fixed(node: Node, observed: FixedObservation, settings: FilterSettin
     nis = float(innovation @ S_inv @ innovation)
     if nis > settings.jump_gate:
         if node.rejected_fixed + 1 < settings.misses:
-            return replace(node, rejected_fixed=node.rejected_fixed + 1, rejected_zoom=0, mean_innovation=(0.0, 0.0))
-        return _size(_restarted(node, observed, settings), observed.size, settings)
-    if nis > settings.gate:  # worse than its noise says: it counts as much as one at the gate
-        S_inv = _inverse(PHt[:2] + R * (nis / settings.gate))
+            return replace(node, rejected_fixed=node.rejected_fixed + 1, rejected_zoom=0)
+        return _correct_size(_restarted(node, observed, settings), observed.size, settings)
+    if nis > CENTER_GATE:  # worse than its noise says: it counts as much as one at the gate
+        S_inv = _inverse(PHt[:2] + R * (nis / CENTER_GATE))
         nis = float(innovation @ S_inv @ innovation)
     gain = PHt @ S_inv
-    P = node.P - gain @ PHt.T
-    node = _with_noise_scale(
-        replace(node, x=node.x + gain @ innovation, P=P, rejected_fixed=0, fixed_t=node.t), nis, settings
+    node = replace(
+        node,
+        x=node.x + gain @ innovation,
+        P=node.P - gain @ PHt.T,
+        mean_nis=_mean_nis(node, nis, settings),
+        rejected_fixed=0,
+        fixed_t=node.t,
     )
-    return _size(node, observed.size, settings)
+    return _correct_size(node, observed.size, settings)
 
 
 def correct_zoom(node: Node, observed: ZoomObservation, settings: FilterSettings) -> Node:
     """Correct a node with a centre in the zoom image, iterated because the depth enters nonlinearly."""
-    if node.rejected_zoom >= settings.zoom_misses or math.hypot(*node.mean_innovation) > settings.most_mean_innovation:
-        node = replace(node, P=_inflated(node.P, settings), rejected_zoom=0, mean_innovation=(0.0, 0.0))
-    # If the fixed image contradicts the state too, the target has moved, and neither its size nor the head is wrong.
-    missed = node.rejected_zoom + (node.rejected_fixed == 0 and node.mean_nis < settings.consistent_nis)
-    x = node.x
-    nis = 0.0
+    if node.rejected_zoom >= settings.zoom_misses:
+        node = replace(node, P=inflated(node.P, settings), rejected_zoom=0)
+    x, nis = node.x, 0.0
     for i in range(MOST_ITERATIONS):
         tangent, J, d = observed.sight.project(x)
-        if d[2] <= 0:
-            return replace(node, rejected_zoom=missed)
         innovation = observed.tangent - tangent + J @ (x - node.x)[SEEN]
         PHt = node.P[:, SEEN] @ J.T
         S_inv = _inverse(J @ PHt[SEEN] + observed.R)
         if i == 0:
             nis = float(innovation @ S_inv @ innovation)
-            if nis > settings.gate:
-                return replace(node, rejected_zoom=missed)
-            mean_innovation = _mean_innovation(node, J @ PHt[SEEN] + observed.R, innovation, settings)
+        if d[2] <= 0 or nis > CENTER_GATE:
+            # Where the fixed image contradicts the state too, the target has moved, and neither size nor head is wrong.
+            return replace(node, rejected_zoom=node.rejected_zoom + (node.rejected_fixed == 0))
         gain = PHt @ S_inv
         before, x = x[L], node.x + gain @ innovation
         if abs(x[L] - before) < CONVERGED:
             break
-    P = node.P - gain @ PHt.T
-    return _with_noise_scale(replace(node, x=x, P=P, rejected_zoom=0, mean_innovation=mean_innovation), nis, settings)
+    mean_nis = _mean_nis(node, nis, settings)
+    return replace(node, x=x, P=node.P - gain @ PHt.T, mean_nis=mean_nis, rejected_zoom=0)
 
 
-def _size(node: Node, size: SizeObservation | None, settings: FilterSettings) -> Node:
+def _correct_size(node: Node, size: SizeObservation | None, settings: FilterSettings) -> Node:
     """Correct a node with an apparent size, which measures l - k - g."""
     if size is None:
         return node
-    P = node.P
-    h = np.zeros(STATES)
-    h[L], h[K], h[G] = 1.0, -1.0, -1.0
+    P, h = node.P, OF_SIZE
     # Limbs and wings move the box's sides together for a while, so sizes in quick succession share their error.
     variance = size.sigma**2 * _variance_factor(node.t - node.size_t, settings.size_s)
     Ph = P @ h
@@ -232,13 +217,12 @@ def _size(node: Node, size: SizeObservation | None, settings: FilterSettings) ->
     innovation = size.log_depth - float(h @ node.x)
     if size.bound and innovation >= 0:  # the state is nearer than the bound already
         return node
-    if innovation * innovation > settings.size_gate * S:
+    if innovation * innovation > GATE * S:
         if node.rejected_size + 1 < settings.misses:
             return replace(node, rejected_size=node.rejected_size + 1)
         # The target has turned or come nearer unexpectedly: inflate depth and attitude.
         P = P.copy()
-        P[L, L] += settings.depth_inflation**2
-        P[G, G] += settings.depth_inflation**2
+        P[[L, G], [L, G]] += settings.inflation**2
         Ph = P @ h
         S = float(h @ Ph) + variance
     x = node.x + Ph * (innovation / S)
@@ -250,10 +234,11 @@ def _with_fading_velocity(node: Node, settings: FilterSettings) -> Node:
     """Let the velocity along the axis fade while no size measures it."""
     if math.isinf(node.size_t):
         return node
+    motion = settings.motion
     rho = math.exp(-(node.t - node.fixed_t) / settings.unsized_s)
-    usual = np.array([settings.motion.speed, settings.motion.acceleration]) * math.exp(-node.x[L])
+    usual = np.array([motion.speed, motion.acceleration]) * math.exp(-node.x[L])
     x, P = node.x.copy(), node.P.copy()
-    along = [W.stop - 1, C.stop - 1]
+    along = [WL, CL]
     x[along] *= rho
     P[along] *= rho
     P[:, along] *= rho
@@ -261,69 +246,40 @@ def _with_fading_velocity(node: Node, settings: FilterSettings) -> Node:
     return replace(node, x=x, P=P)
 
 
-def _with_noise_scale(node: Node, nis: float, settings: FilterSettings) -> Node:
-    """Update the mean NIS and scale the process noise with it: a target beyond prediction manoeuvres harder."""
-    mean = node.mean_nis + settings.nis_gain * (nis / 2 - node.mean_nis)
-    noise_scale = min(max(mean, 1.0), settings.most_noise_scale)
-    if node.jumped(settings.motion.jump):
-        noise_scale = max(noise_scale, settings.jump_noise_scale)
-    return replace(node, mean_nis=mean, noise_scale=noise_scale)
-
-
-def _mean_innovation(node: Node, S: Array, innovation: Array, settings: FilterSettings) -> tuple[float, float]:
-    """Average the zoom image's innovations; a mean far from zero shows a bias, however small it is."""
-    if node.mean_nis >= settings.consistent_nis:  # the target manoeuvres, so its innovation shows nothing of the head
-        return 0.0, 0.0
-    g = settings.mean_innovation_gain
-    u, v = node.mean_innovation
-    return (
-        u + g * (float(innovation[0]) / math.sqrt(S[0, 0]) - u),
-        v + g * (float(innovation[1]) / math.sqrt(S[1, 1]) - v),
-    )
+def _mean_nis(node: Node, nis: float, settings: FilterSettings) -> float:
+    """Update the mean NIS with that of a centre, which has two dimensions."""
+    return node.mean_nis + settings.nis_gain * (nis / 2 - node.mean_nis)
 
 
 def _restarted(node: Node, observed: FixedObservation, settings: FilterSettings) -> Node:
     """Restart position and motion at the measured place after a jump; size and head bias stay."""
     motion = settings.motion
-    nearness = math.exp(-node.x[L])
     x, P = node.x.copy(), node.P.copy()
     x[:2] = observed.tangent
     x[C] = 0.0  # the velocity stays the best guess: a target that is carried off is soon farther off
-    moved = [A, B, *range(W.start, C.stop)]
-    P[moved] = 0.0
-    P[:, moved] = 0.0
+    restarted = [A, B, *range(WA, K)]
+    P[restarted] = 0.0
+    P[:, restarted] = 0.0
     P[:2, :2] = observed.R
-    # Along the axis only sizes measure, and badly: the target is taken as no faster there than usual.
-    speeds = motion.jump.speed, motion.jump.speed, motion.speed
-    accelerations = motion.jump.acceleration, motion.jump.acceleration, motion.acceleration
-    P[range(3, 9), range(3, 9)] = (np.array([*speeds, *accelerations]) * nearness) ** 2
-    P[L, L] += settings.depth_inflation**2
-    return replace(
-        node,
-        x=x,
-        P=P,
-        rejected_fixed=0,
-        rejected_zoom=0,
-        mean_innovation=(0.0, 0.0),
-        mean_nis=1.0,
-        noise_scale=settings.jump_noise_scale,
-        jump_t=node.t,
-    )
+    P[L, L] += settings.inflation**2
+    P[range(WA, K), range(WA, K)] = (np.repeat([motion.speed, motion.acceleration], 3) * math.exp(-x[L])) ** 2
+    # It is faster than was expected, except along the axis, where only sizes measure, and badly.
+    P[[WA, WB], [WA, WB]] *= settings.most_noise_scale
+    return replace(node, x=x, P=P, rejected_fixed=0, rejected_zoom=0, mean_nis=1.0)
 
 
-def _inflated(P: Array, settings: FilterSettings) -> Array:
+def inflated(P: Array, settings: FilterSettings) -> Array:
     """Inflate size, depth and head bias after zoom images that contradict them."""
     P = P.copy()
     # Size and depth are inflated together, because the fixed image keeps their ratio known.
-    P[np.ix_([L, K], [L, K])] += settings.size_inflation**2
-    P[PAN, PAN] += settings.bias_inflation**2
-    P[TILT, TILT] += settings.bias_inflation**2
+    P[np.ix_([L, K], [L, K])] += settings.inflation**2
+    P[[PAN, TILT], [PAN, TILT]] += settings.bias_inflation**2
     return P
 
 
 def _variance_factor(interval: float, correlation_s: float) -> float:
-    """Factor on a variance whose error lasts correlation_s [s], for measurements an interval apart [s]."""
-    return max(1.0, 2 * correlation_s / max(interval, LEAST_INTERVAL_S))
+    """Factor on a variance whose error lasts correlation_s [s], for measurements an interval > 0 apart [s]."""
+    return max(1.0, 2 * correlation_s / interval)
 
 
 def _inverse(S: Array) -> Array:
@@ -403,7 +359,7 @@ class TargetFilter:
         nominal_px: float,
         t: float,
         *,
-        head_sigma: float | None = None,
+        head_sigma: float = HEAD_SIGMA,
     ) -> bool:
         """Add a centre of the target in the zoom image.
 
@@ -415,7 +371,7 @@ class TargetFilter:
             nominal_px: nominal focal length reported for that time [px].
             t: exposure time of the frame [s].
             head_sigma: standard deviation of the reported angles [rad]; larger while the head moves and the time is
-                uncertain. By default from the settings.
+                uncertain.
 
         Returns:
             False if the measurement was not added, see `update_fixed`.
@@ -425,8 +381,7 @@ class TargetFilter:
         if found is None:
             return False
         z, J = found
-        sigma = self._settings.head_sigma if head_sigma is None else head_sigma
-        R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * sigma**2
+        R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * head_sigma**2
         return self._insert(ZoomObservation(t, z, R, self._sight_lines.at(pan, tilt, nominal_px)))
 
     def at(self, t: float) -> Estimate | None:
@@ -439,15 +394,12 @@ class TargetFilter:
         if node is None:
             return None
         x, P = self._propagate(node, t)
-        motion = self._settings.motion
         return Estimate(
             t=t,
             measured_t=node.t,
             state=x,
             state_covariance=P,
-            carried=motion.jump.by_hand_s is not None and node.jumped(motion.jump),
-            size_prior=motion.size_sigma,
-            bias_prior=motion.bias_sigma,
+            motion=self._settings.motion,
             target=self._target,
             calibration=self._calibration,
             sight_lines=self._sight_lines,
@@ -459,29 +411,29 @@ class TargetFilter:
 
     def _propagate(self, node: Node, t: float) -> tuple[Array, Array]:
         """Predict state and covariance from a node to time t [s], which is no earlier."""
-        settings = self._settings
-        motion = settings.jump_motion if node.jumped(settings.motion.jump) else settings.motion
-        return propagate(node.x, node.P, t - node.t, motion, node.noise_scale)
+        noise_scale = min(max(node.mean_nis, 1.0), self._settings.most_noise_scale)
+        return propagate(node.x, node.P, t - node.t, self._settings.motion, noise_scale)
 
     def _before(self, t: float) -> Node | None:
         """Return the newest node that is no later than time t [s]."""
-        node = next((node for node in reversed(self._nodes) if node is not None and node.t <= t), self._base)
-        return None if node is None or node.t > t else node
+        for node in (*reversed(self._nodes), self._base):
+            if node is not None and node.t <= t:
+                return node
+        return None
 
     def _size(self, size_px: float, tangent_per_px: float, *, bound: bool) -> SizeObservation | None:
         """Convert a size in the image [px], or a lower bound of it, to a size measurement."""
         if not size_px > 0:
             return None
-        settings = self._settings
-        sigma = math.hypot(settings.size_noise, settings.size_noise_px / size_px)
+        sigma = math.hypot(self._settings.side_of_size, self._settings.side_px / size_px)
         return SizeObservation(math.log(self._target.size / (size_px * abs(tangent_per_px))), sigma, bound)
 
     def _insert(self, observed: FixedObservation | ZoomObservation) -> bool:
         """Insert an observation at its time, repeat the later corrections, and drop what is older than the history."""
         if not math.isfinite(observed.t) or (self._base is not None and observed.t < self._base.t):
             return False
-        at = bisect.bisect_left(self._observed, observed.key, key=lambda each: each.key)
-        if at < len(self._observed) and self._observed[at].key == observed.key:  # a repeated frame
+        at = bisect.bisect_left(self._observed, KEY(observed), key=KEY)
+        if at < len(self._observed) and KEY(self._observed[at]) == KEY(observed):  # a repeated frame
             return False
         self._observed.insert(at, observed)
         del self._nodes[at:]

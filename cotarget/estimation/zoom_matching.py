@@ -18,11 +18,10 @@ from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.detection import Detection
 from cotarget.estimation.correlation import Samples, correlate, resample, summit
+from cotarget.estimation.motion_model import GATE
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
-# Gate on squared distances in standard deviations.
-GATE = 3.0**2
 # Standard deviation of the body's centre along u and v, in parts of the box's sides, by the target profile's matcher;
 # None where the outline is not known. Measured on simulated targets.
 BODY_SIGMA = {"box": (0.01, 0.01), "upright": (0.03, 0.006), "outline": (0.05, 0.12), None: (0.08, 0.18)}

@@ -90,7 +90,6 @@ class Known:
     t: float
     sigma: float = 1e-4
     bias: tuple = (0.0, 0.0)
-    carried: bool = False
     target = BOOK
     calibration = CALIBRATION
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from cotarget.control.controller import goal_sigmas_of
 from cotarget.control.head import HeadController, HeadSettings
 from cotarget.estimation import TargetFilter
 from cotarget.rig import PanTiltLimits, PanTiltState
@@ -20,7 +19,6 @@ LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians
 LATENCY, DELAY = 0.12, 0.08  # from light to frame, and from command to motion [s]
 SECONDS = 8.0
 EXPOSURE = 0.01  # [s]
-AHEAD = HeadSettings().ahead_s
 FRAME = 1 / RATE
 NOMINAL = {"book": 160 * 10 / 0.234, "person": 300 * 10 / 1.75}  # for the size wanted at 10 m
 
@@ -91,9 +89,8 @@ def follow(name, seed, settings):
             head.move(t, *goals, None)
         else:
             head_controller.head.correct(PanTiltState(*head.at(t), True, t))
-            late, ahead = effect - estimates[0].measured_t, estimator.at(effect + AHEAD)
-            doubts = goal_sigmas_of(ahead, aims[0]) if ahead.carried else (0.0, 0.0)
-            command = head_controller.decide(effect, 1 / RATE, wanted, rates, field_angle, late, doubts)
+            late = effect - estimates[0].measured_t
+            command = head_controller.decide(effect, 1 / RATE, wanted, rates, field_angle, late)
             if command is not None:
                 head.move(t, command.pan, command.tilt, command.speed)
         if t > 1.5:
@@ -230,21 +227,6 @@ def test_an_axis_that_stands_is_left_alone_while_the_other_turns():
     assert len(set(tilts)) == 1
     # It is sent on when it is not near any more.
     assert head_controller.decide(4.0, FRAME, (0.5 + 0.3 * 4.0, 0.1 + 2 * ZONE), (0.3, 0.0), WIDTH).tilt > tilts[-1]
-
-
-@pytest.mark.parametrize(("doubt", "turns_back"), [(0.0, True), (0.1, False), (0.01, True)])
-def test_what_is_carried_does_not_have_the_head_turn_back_for_less_than_is_doubted(doubt, turns_back):
-    """Half a standard deviation is less than what is doubted: of 0.1 rad it is more than the goal goes back by."""
-    head_controller = standing()
-    tilts = [
-        head_controller.decide(
-            i * FRAME, FRAME, (0.5 + 0.3 * i * FRAME, tilt), (0.3, 0.1), WIDTH, 0.0, (doubt, doubt)
-        ).tilt
-        for i, tilt in enumerate((0.1, 0.12, 0.09))
-    ]
-    assert tilts[1] > tilts[0]
-    assert (tilts[2] < tilts[1]) == turns_back
-    assert turns_back or tilts[2] == tilts[1]
 
 
 def test_a_goal_is_within_the_limits():
