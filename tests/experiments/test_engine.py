@@ -92,6 +92,8 @@ def test_more_seeds_are_added_to_those_that_are_there(run, tmp_path):
     page = (tmp_path / "out" / "report.html").read_text()
     assert "--seeds 1" in page
     assert "--report" not in page
+    status, told, _ = run("tiny", *noted(tmp_path, "tiny"), "--seeds", "5", "--report")
+    assert (status, "2 seeds are not done yet" in told) == (1, True)
 
 
 def test_settings_can_be_swept(run, tmp_path):
