@@ -1,7 +1,6 @@
 """Run the fixed camera's detector and tracker on a film; write a table of tracks, and the film with tracks drawn."""
 
-from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -129,21 +128,17 @@ class Trails:
     """Draw tracks as boxes with their id and their trail."""
 
     def __init__(self) -> None:
-        self._trails: dict[int, deque[tuple[float, Array]]] = {}
+        self._trails: dict[int, list[tuple[float, Array]]] = {}
 
-    def draw(self, image: Image, tracks: Iterable[Track], t: float) -> Image:
-        """Draw confirmed tracks on a copy of an image; a box is thin while its target is only predicted."""
+    def draw(self, image: Image, tracks: Sequence[Track], t: float) -> Image:
+        """Draw tracks on a copy of an image; a box is thin while its target is only predicted."""
         image = image.copy()
-        tracks = [track for track in tracks if track.confirmed]
+        self._trails = {
+            track.id: [at for at in self._trails.get(track.id, []) if at[0] >= t - TRAIL_S] + [(t, track.center_px)]
+            for track in tracks
+        }
         for track in tracks:
-            self._trails.setdefault(track.id, deque()).append((t, track.center_px))
-        alive = {track.id for track in tracks}
-        self._trails = {number: trail for number, trail in self._trails.items() if number in alive}
-        for track in tracks:
-            colour = COLOURS[track.id % len(COLOURS)]
-            trail = self._trails[track.id]
-            while trail[0][0] < t - TRAIL_S:
-                trail.popleft()
+            colour, trail = COLOURS[track.id % len(COLOURS)], self._trails[track.id]
             way = np.rint([center for _, center in trail]).astype(np.int32)
             cv2.polylines(image, [way.reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA)
             draw_box(image, track.center_px, track.size_px, colour, str(track.id), bold=track.missed == 0)

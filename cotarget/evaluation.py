@@ -295,7 +295,7 @@ def _closeup(truth: Appearances, name: str, target: TargetProfile, t: float, out
 def decodes(frame: Frame, outline: Silhouette | None, marker: int) -> bool:
     """Return whether a target's marker, an id of `MARKERS`, can be read in a frame.
 
-    Only the surroundings of the true outline are searched: that is fast, and a marker elsewhere is another target's.
+    Only the surroundings of the true outline are searched: that is fast, and a marker outside is another target's.
     """
     if outline is None or outline.visible <= 0:
         return False
@@ -317,7 +317,7 @@ def off_target(tracks: Iterable[Track], outlines: Iterable[Silhouette | None]) -
 
 
 def on_target(tracks: Iterable[Track], outlines: Mapping[str, Silhouette | None]) -> list[tuple[int, str]]:
-    """List confirmed tracks with a detection of their own, each with every target that it is on, the nearest first.
+    """List confirmed tracks with an unshared detection, each with every target that it is on, the nearest first.
 
     A coasting track is no evidence, and one that shares a box with others would be on all of them.
     """

@@ -98,7 +98,7 @@ class Row:
         in_wide: whether the target is wholly in the fixed image.
         u_wide_px: true position in the fixed image [px].
         v_wide_px: its v coordinate [px].
-        u_detected_px: centre of the followed track's detection in the fixed image [px]; nan without one of its own.
+        u_detected_px: centre of the followed track's unshared detection in the fixed image [px]; nan without one.
         v_detected_px: its v coordinate [px].
         decoded: whether the target's marker decodes in the zoom image.
         decoded_wide: whether the target's marker decodes in the fixed image.
@@ -114,7 +114,7 @@ class Row:
         target: name of the followed target.
         head_commands: commands sent to the head until then, whether its goal changed or not.
         lens_commands: commands sent to the lens until then.
-        on_target: confirmed tracks with a detection of their own in the fixed frame, each with every target that it is
+        on_target: confirmed tracks with an unshared detection in the fixed frame, each with every target that it is
             on, the nearest first, as "3:bird 3:bird2 7:bird".
     """
 

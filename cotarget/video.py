@@ -43,7 +43,6 @@ class Places:
         # For each packet: its part of the film, its time in that part, and whether it must become a frame.
         self._waiting: dict[int, tuple[int, int, bool]] = {}
         self._packets = self._part = self._time = 0
-        self._begun = False
         self._refused = self._refused_inside = self._lost = 0
         # Number of the first lost frame, and of the first frame after a refusal.
         self._first: int | None = None
@@ -59,10 +58,8 @@ class Places:
         if packet.dts is not None:
             self._part += packet.dts < self._time  # time restarts where films were joined
             self._time = packet.dts
-        self._begun = self._begun or packet.is_keyframe  # nothing can be decoded before a keyframe
-        needed = self._begun and packet.size >= self._smallest and not packet.is_discard
         packet.opaque = self._packets
-        self._waiting[self._packets] = self._part, packet.pts, needed
+        self._waiting[self._packets] = self._part, packet.pts, packet.size >= self._smallest
         self._packets += 1
 
     def refuse(self, error: av.error.FFmpegError) -> None:

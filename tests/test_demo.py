@@ -107,8 +107,8 @@ POINTING_MEDIAN_DEG, POINTING_P95_DEG = 0.05, 0.10
 @pytest.mark.slow
 @pytest.mark.render
 def test_the_demo_reaches_its_figures(tmp_path):
-    told = []
-    metrics = run_demo(tmp_path, 0, lambda *what: told.append(what))
+    reported = []
+    metrics = run_demo(tmp_path, 0, lambda *what: reported.append(what))
     print(summary(metrics))
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     pointing = metrics["calibration"]["pointing_error_deg"]
@@ -128,4 +128,4 @@ def test_the_demo_reaches_its_figures(tmp_path):
     film.release()
     assert (tmp_path / "calibration.json").is_file()
     assert not [path for path in Path(tmp_path).iterdir() if path.name.startswith(".")]
-    assert all(0 <= done <= total for _, done, total in told)
+    assert all(0 <= done <= total for _, done, total in reported)

@@ -70,10 +70,10 @@ def test_the_picture_of_a_target_enlarges_the_fixed_frame_as_much_as_the_close_u
 
 
 def test_the_rigs_frames_have_the_names_of_the_paper(monkeypatch):
-    told = []
-    monkeypatch.setattr(drawing, "write_text", lambda image, text, *_: told.extend(text.split(", ")))
+    shown = []
+    monkeypatch.setattr(drawing, "write_text", lambda image, text, *_: shown.extend(text.split(", ")))
     draw_frames(PICTURE, {"fixed": np.zeros(2), "zoom": np.ones(2), "base": np.ones(2)})
-    assert set(told) == {"fixed", "zoom0", "base", "head", "Gamma", "T"}
+    assert set(shown) == {"fixed", "zoom0", "base", "head", "Gamma", "T"}
 
 
 VISIBLE = 80  # least difference of something drawn from its background [grey levels]

@@ -37,7 +37,7 @@ def test_the_truth_detector_has_the_errors_of_its_noise():
             offs.append(one.center_px - (low + high) / 2)
             sides.append(one.size_px / (high - low) - 1)
             assert not one.clipped
-        assert missed / len(TIMES) == pytest.approx(0.2, abs=0.06)  # 500 tell it to 2 %
+        assert missed / len(TIMES) == pytest.approx(0.2, abs=0.06)  # the standard deviation over 500 frames is 2 %
         assert np.std(offs, axis=0) == pytest.approx([0.7, 0.7], rel=0.15)
         assert np.std(sides, axis=0) == pytest.approx([0.1, 0.1], rel=0.15)
         exact = TruthDetector(truth, 5, TruthNoise(0.0, 0.0, 0.0)).detect(Frame(image, 1.0))[0]
@@ -73,7 +73,9 @@ def test_the_truth_finder_finds_a_target_within_the_gate_alone():
         seeds = [TruthFinder(calibration, target, truth, "book", seed) for seed in range(200)]
         found = [each.find(frame, expected(x_fixed)) for each in seeds]
         aside = np.std([each.center_px - at for each in found if each is not None], axis=0)
-        assert aside == pytest.approx([TruthFinder.SIGMA_PX] * 2, rel=0.2)  # 200 tell it to 5 %
+        assert aside == pytest.approx(
+            [TruthFinder.SIGMA_PX] * 2, rel=0.2
+        )  # the standard deviation over 200 seeds is 5 %
         assert sum(each is None for each in found) < 10  # of noise beyond the gate
         assert seeds[0].find(frame, expected(x_fixed * [1.0, 1.1, 1.0])) is None
         blind = TruthFinder(calibration, target, truth, "book", 0, missed=lambda t: True)

@@ -232,7 +232,7 @@ def test_reversals(pairs, reversals):
 
 
 def test_commands_to_the_same_goal_count():
-    """A command with every row to the same goal, and a lens that was told something with every tenth."""
+    """A command with every row to the same goal, and one to the lens with every tenth."""
     rows = [
         dataclasses.replace(row, head_commands=7 + i, lens_commands=1 + i // 10) for i, row in enumerate(run((150, {})))
     ]

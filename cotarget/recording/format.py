@@ -339,7 +339,7 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
             elif "end" in row:
                 ending = str(row["end"])
             else:
-                rows.append(_whole(directory, _parsed(number, parse_event, row)))
+                rows.append(_with_image_on_disk(directory, _parsed(number, parse_event, row)))
     except _DamageError as damage:
         stop = str(damage)
     if spec is None:
@@ -444,7 +444,7 @@ def _parsed(number: int, parse: Callable[..., Parsed], *row: Any) -> Parsed:
         raise _DamageError(f"line {number} of {LOG} is damaged: {reason}") from None
 
 
-def _whole(directory: Path, event: Event) -> Event:
+def _with_image_on_disk(directory: Path, event: Event) -> Event:
     """Check that an event's image is on disk; a frame of the zoom camera may lack it."""
     if event.image is None:
         if event.call == "fixed.read" and event.error is None:

@@ -62,7 +62,7 @@ if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # older versions of OpenCV always use th
 
 
 @dataclass(eq=False)
-class _Picture:
+class _ImageFile:
     """An image on its way to the disk; ``image`` is None once it is written, or if it is dropped."""
 
     name: str
@@ -87,11 +87,11 @@ class RecordWriter:
         for name in (FIXED, ZOOM):
             (directory / name).mkdir()
         self._log = (directory / LOG).open("xb", buffering=0)  # unbuffered: a written line survives the program's death
-        self._queue: collections.deque[tuple[Event | dict[str, Any], _Picture | None]] = collections.deque()
+        self._queue: collections.deque[tuple[Event | dict[str, Any], _ImageFile | None]] = collections.deque()
         self._changed = threading.Condition()
         self._waiting = 0
         self._closing = False
-        self._last: dict[str, tuple[float, Image, _Picture]] = {}
+        self._last: dict[str, tuple[float, Image, _ImageFile]] = {}
         self._numbers = {FIXED: 0, ZOOM: 0}
         self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
         self._thread.start()
@@ -99,12 +99,12 @@ class RecordWriter:
     def put(self, event: Event | dict[str, Any], camera: str = "", image: Image | None = None) -> None:
         """Queue a line of the log; the image of an event's frame goes to the camera's folder and must not change."""
         with self._changed:
-            picture = None
+            file = None
             if image is not None and not self.failure:
                 assert isinstance(event, Event)
-                picture = self._picture(camera, image, event.numbers[0])
+                file = self._file_of(camera, image, event.numbers[0])
             if not self.failure:  # checked again: it may have failed during the wait for room
-                self._queue.append((event, picture))
+                self._queue.append((event, file))
                 self._changed.notify_all()
 
     @property
@@ -120,24 +120,24 @@ class RecordWriter:
         self._thread.join()
         self._log.close()
 
-    def _picture(self, camera: str, image: Image, t: float) -> _Picture:
+    def _file_of(self, camera: str, image: Image, t: float) -> _ImageFile:
         """Make an image's file, or return the last one if the frame is the same."""
         if camera in self._last:
             last_t, last_image, last = self._last[camera]
             if last_t == t and (last_image is image or np.array_equal(last_image, image)):
                 return last
-        picture = _Picture(f"{camera}/{self._numbers[camera]:06d}.png", image)
+        file = _ImageFile(f"{camera}/{self._numbers[camera]:06d}.png", image)
         self._numbers[camera] += 1
         if camera == ZOOM and self._waiting + image.nbytes > ZOOM_ROOM:
-            picture = replace(picture, image=None, dropped=True)
+            file = replace(file, image=None, dropped=True)
             if self.dropped == 0:
                 log.warning("the disk is too slow for the recording: images of the zoom camera are left out")
             self.dropped += 1
         else:
             self._changed.wait_for(lambda: not self._waiting or self._waiting + image.nbytes <= ROOM or self.failure)
             self._waiting += image.nbytes
-        self._last[camera] = (t, image, picture)
-        return picture
+        self._last[camera] = (t, image, file)
+        return file
 
     def _work(self) -> None:
         try:
@@ -146,8 +146,8 @@ class RecordWriter:
                     self._changed.wait_for(lambda: self._queue or self._closing)
                     if not self._queue:
                         return
-                    event, picture = self._queue[0]
-                self._write(event, picture)
+                    event, file = self._queue[0]
+                self._write(event, file)
                 self._queue.popleft()  # only now, so that the queue holds all that is not written yet
         except (OSError, cv2.error) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).strip()
@@ -163,17 +163,17 @@ class RecordWriter:
             self._queue.clear()
             self._changed.notify_all()
 
-    def _write(self, event: Event | dict[str, Any], picture: _Picture | None) -> None:
-        if picture is not None:
-            if picture.image is not None:
-                picture.size_bytes = write_png(self._directory / picture.name, picture.image)
+    def _write(self, event: Event | dict[str, Any], file: _ImageFile | None) -> None:
+        if file is not None:
+            if file.image is not None:
+                file.size_bytes = write_png(self._directory / file.name, file.image)
                 with self._changed:
-                    self._waiting -= picture.image.nbytes
-                    picture.image = None
+                    self._waiting -= file.image.nbytes
+                    file.image = None
                     self._changed.notify_all()
-            if not picture.dropped:
+            if not file.dropped:
                 assert isinstance(event, Event)
-                event = replace(event, image=picture.name, size_bytes=picture.size_bytes)
+                event = replace(event, image=file.name, size_bytes=file.size_bytes)
         text = event_line(event) if isinstance(event, Event) else json.dumps(event, allow_nan=False)
         self._log.write(text.encode() + b"\n")
 

@@ -130,7 +130,7 @@ class Replay:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._spans, self._frames = _cut(recording.events)
+        self._spans, self._frames = _spans_and_frames(recording.events)
         self._differing: set[int] = set()  # places of the frames whose commands differ
         self._first: int | None = None  # the first of them
         self._broke_off = not recording.truncated and recording.ending != COMPLETE
@@ -290,7 +290,7 @@ class Replay:
         return RecordingEndedError(f"{self._recording.directory}: the recording ends here, at {self.now:.2f} s")
 
 
-def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
+def _spans_and_frames(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
     """Return the spans between frames, the first before any, and the frames; calls of other threads are left out."""
     spans, frames = [_Span()], []
     for event in events:
@@ -368,7 +368,7 @@ class _ZoomCamera(_Camera):
         self._frames = [e for e in recording.events if e.call == "zoom.read" and e.error is None]
         self._kept = [e for e in self._frames if e.image is not None]
         states = [e for e in recording.events if e.call == "zoom.state" and e.error is None]
-        self._states = _Track(states)
+        self._states = _StateHistory(states)
 
     @property
     def still_size(self) -> tuple[int, int]:
@@ -427,7 +427,7 @@ class _ZoomCamera(_Camera):
 class _Head:
     def __init__(self, replay: Replay, recording: Recording) -> None:
         self._replay, self._limits = replay, recording.spec.head.limits
-        self._states = _Track([e for e in recording.events if e.call == "head.state" and e.error is None])
+        self._states = _StateHistory([e for e in recording.events if e.call == "head.state" and e.error is None])
 
     @property
     def limits(self) -> PanTiltLimits:
@@ -491,7 +491,7 @@ class _Board:
         """Do nothing: the board is in the recorded images."""
 
 
-class _Track:
+class _StateHistory:
     """Recorded states of a device: numbers, whether it moved, and the time."""
 
     def __init__(self, events: Sequence[Event]) -> None:

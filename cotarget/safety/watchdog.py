@@ -162,7 +162,7 @@ class Watchdog:
         return True
 
     def halt(self) -> None:
-        """Halt the head on the program's request; if the device fails, the watchdog tries again.
+        """Halt the head; if the device fails, the watchdog tries again.
 
         Raises:
             Exception: as the device raised it.
@@ -235,19 +235,14 @@ class Watchdog:
         self._look.close()
 
     def _halt(self) -> None:
-        """Halt the head; if the device fails, log that and schedule another try."""
-        with self._lock:
-            motion, self._halts = self._motion, self._halts + 1
+        """Halt the head; log the first failure of the device, after which the watchdog tries again."""
+        first = self._owed is None
         try:
-            self._head.halt()
+            self.halt()
         except Exception as error:
-            with self._lock:
-                first, self._owed = self._owed is None, str(error)
             if first and not self._shut:
                 self.logged = str(error)
                 log.error("the head could not be halted and will be halted again: %s", error)
-            return
-        self._rests(motion)
 
     def _rests(self, motion: Motion | None) -> None:
         """Register a successful halt; a command sent after ``motion`` stays under watch."""

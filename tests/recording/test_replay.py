@@ -26,7 +26,7 @@ from cotarget.errors import ConfigError, CotargetError, DeviceError, HaltedError
 from cotarget.estimation import Estimate
 from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.recording.recorder import Recorder
-from cotarget.recording.replay import Differences, RecordingEndedError, Replay, until_end
+from cotarget.recording.replay import RecordingEndedError, Replay, until_end
 from cotarget.rig import PanTiltState
 from cotarget.sim.world import SimWorld
 from tests.support.commands import true_calibration
@@ -189,13 +189,6 @@ def test_commands_that_differ_are_counted_and_measured(recorded):
     assert len(moved[::2]) <= halved.frames_differing <= len(moved[::2]) + others
 
 
-def test_differences_in_words():
-    assert "5 commands" in str(Differences(moves=3, zooms=2))
-    text = str(Differences(9, 2, 0.5, 4, 1, 30.0, 7, 6, 50, 12, 3, 0.118))
-    for part in ("12 of 50", "frame 3 (0.12 s)", "2 of 9", "0.5 degrees", "1 of 4", "30 px", "7 ", "6 "):
-        assert part in text
-
-
 @pytest.fixture(scope="module")
 def recording_of_track_2(tmp_path_factory):
     """A recording of a run that follows the second track alone, which appears late."""
@@ -237,6 +230,8 @@ def test_the_command_reports_differences_and_fails_with_check(replayed):
     line = f"cotarget replay: the commands of {found['frames_differing']} of {result['steps']} frames differ"
     assert said.splitlines()[-1].startswith(line)
     assert f"from frame {found['first_frame']} ({found['first_s']:.2f} s) on" in said
+    assert f"{found['moves_differing']} of {found['moves']} moves differ, by {found['largest_deg']:.3g} degrees" in said
+    assert f"{found['zooms_differing']} of {found['zooms']} focal lengths, by {found['largest_px']:.3g} px" in said
     assert found["first_frame"] < 20  # the first bird is believed by then
     assert replayed("--policy", "first-come", "--check")[:2] == (1, result)
 
@@ -359,7 +354,7 @@ def test_a_recorded_error_is_raised_again(by_hand, error, kind, message):
 
 
 class GarbledError(HaltedError):
-    """An error of a driver of its own."""
+    """An error that a driver defines."""
 
 
 def test_an_error_of_another_module_is_replayed_as_its_nearest_base_class(tmp_path):

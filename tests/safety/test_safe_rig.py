@@ -90,8 +90,8 @@ def test_no_command_leaves_the_limits_or_exceeds_the_cap(step, soft):
     pan, tilt = (np.mean(limits) for limits in allowed)  # what is allowed is done, to a step
     said = safe.move(pan, tilt)
     assert np.allclose(said, (pan, tilt), rtol=0, atol=step / 2 + ROUNDING)
-    for told, limits in zip((safe.limits.pan, safe.limits.tilt), allowed, strict=True):
-        assert np.allclose(told, limits, rtol=0, atol=ROUNDING)
+    for shown, limits in zip((safe.limits.pan, safe.limits.tilt), allowed, strict=True):
+        assert np.allclose(shown, limits, rtol=0, atol=ROUNDING)
     assert safe.limits.speed == pytest.approx(cap)
 
 
@@ -187,21 +187,21 @@ def test_a_still_may_be_old_when_it_arrives_but_not_older_than_its_request():
     safe = guarded(rig, SafetyConfig(max_frame_age_s=0.5))
     exposed = 5.4
     assert safe.zoom.capture().t == 5.4
-    exposed = 5.4  # once more the same, 2.6 s before it was asked for
+    exposed = 5.4  # 2.6 s before the second request
     with pytest.raises(StaleFrameError, match=r"2\.60 s"):
         safe.zoom.capture()
 
 
 def test_the_cameras_are_otherwise_unchanged():
-    rig, told = Devices(), []
+    rig, shown = Devices(), []
     rig.zoom = SimpleNamespace(
         size=(320, 240), still_size=(3264, 2448), focal_range=(300.0, 4000.0), state=lambda: "state",
-        zoom=lambda f: told.append(f) or 512.0,
+        zoom=lambda f: shown.append(f) or 512.0,
     )  # fmt: skip
     guard = guarded(rig, SafetyConfig())
     safe = guard.zoom
     assert (safe.size, safe.still_size, safe.focal_range) == ((320, 240), (3264, 2448), (300.0, 4000.0))
-    assert (safe.state(), safe.zoom(500.0), told) == ("state", 512.0, [500.0])
+    assert (safe.state(), safe.zoom(500.0), shown) == ("state", 512.0, [500.0])
     guard.fixed.read(3.0, 0.2)
     assert rig.asked == [(3.0, 0.2)]
 

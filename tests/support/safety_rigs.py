@@ -1,4 +1,4 @@
-"""Rigs for the tests of the safety layer: one that simulates its head, and one in real time that hangs when told to."""
+"""Rigs for the tests of the safety layer: one with a simulated head, and one in real time that can hang."""
 
 import threading
 import time
@@ -40,7 +40,7 @@ class Camera:
 
 
 class NotingHead(SimPanTilt):
-    """The simulation's head, which notes what it is told and when, and does not halt when it is broken."""
+    """The simulation's head, which logs its commands with their times, and can fail to halt."""
 
     def __init__(self, clock):
         self.drive = head_drive(SimHead(), SimEffects())
@@ -77,7 +77,7 @@ class SimulatedDevices:
 
 
 class RealHead:
-    """Goes nowhere; each call hangs for as long as the test says."""
+    """A head that does not move; `hang` is called during each move."""
 
     limits = PanTiltLimits((-2.0, 2.0), (-1.0, 1.0), 4.0, 40.0, 0.0)
 
