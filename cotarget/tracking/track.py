@@ -1,8 +1,8 @@
 """Filter one track in the image: constant velocity in (u, v), with histories of size and travel.
 
 The Kalman filter is driven by white acceleration, so frames may come at any times. Neither motion nor measurement mixes
-u and v, so `ImageFilter` has a filter for each coordinate. They compute in floats: numpy takes ten times as long for so
-few numbers, and every track has two of them in every frame. Users of the tracker see a frozen `Track`.
+u and v, so each coordinate has a filter of its own. They compute in floats: numpy takes ten times as long for so few
+numbers, and every track has two of them in every frame. Users of the tracker see a frozen `Track`.
 """
 
 import math
@@ -10,7 +10,6 @@ import statistics
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -67,77 +66,14 @@ class AxisFilter:
         )
 
 
-class ImageFilter:
-    """Kalman filter of a target in the image: centre (u, v) [px] and its velocity [px/s]."""
-
-    def __init__(
-        self, center: Sequence[float], variance: Sequence[float], velocity_variance: float, process_noise: float
-    ) -> None:
-        """Begin at rest.
-
-        Args:
-            center: first measured centre [px], (2,).
-            variance: its variances [px^2], (2,).
-            velocity_variance: variance of the unknown velocity, along each axis [px^2/s^2].
-            process_noise: spectral density of the white acceleration [px^2/s^3].
-        """
-        self._axes = [AxisFilter(at, var, velocity_variance) for at, var in zip(center, variance, strict=True)]
-        self._process_noise = process_noise
-
-    @property
-    def center(self) -> tuple[float, float]:
-        """Centre (u, v) [px]."""
-        u, v = self._axes
-        return u.position, v.position
-
-    @property
-    def velocity(self) -> tuple[float, float]:
-        """Velocity (du, dv) [px/s]."""
-        u, v = self._axes
-        return u.velocity, v.velocity
-
-    @property
-    def center_variance(self) -> tuple[float, float]:
-        """Variances of the centre along u and v, which are uncorrelated [px^2]."""
-        u, v = self._axes
-        return u.covariance.position, v.covariance.position
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance of (u, v, du, dv), (4, 4)."""
-        u, v = (axis.covariance for axis in self._axes)
-        return np.array(
-            [
-                [u.position, 0.0, u.cross, 0.0],
-                [0.0, v.position, 0.0, v.cross],
-                [u.cross, 0.0, u.velocity, 0.0],
-                [0.0, v.cross, 0.0, v.velocity],
-            ]
-        )
-
-    def predict(self, dt: float) -> None:
-        """Predict ``dt`` [s] ahead."""
-        for axis in self._axes:
-            axis.predict(dt, self._process_noise)
-
-    def correct(self, center: Sequence[float], variance: Sequence[float]) -> None:
-        """Correct with a measured centre [px] and its variances [px^2], (2,) each."""
-        for axis, at, var in zip(self._axes, center, variance, strict=True):
-            axis.correct(at, var)
-
-
 # Histories of a track's size and travel
 
 # Quantile of the larger side over a wing beat that counts as its maximum, robust against one wrong frame in ten.
 BEAT_PART = 0.9
-# Boxes whose median gives a start or end of the travel, because outlines flicker; at most this part of all boxes.
-ENDS, END_PART = 3, 1 / 3
 # Largest part of the travel in one step; beyond it the outline jumped to that of another thing.
 LARGEST_STEP = 2 / 3
 # A shorter step is no jump: outlines consist of whole pixels and flicker [px].
 LEAST_JUMP_PX = 3.0
-# An edge this near to the image's border may lie beyond it [px].
-BORDER_PX = 0.5
 Edges = tuple[float, float]
 
 
@@ -146,53 +82,27 @@ class SizeHistory:
 
     Attributes:
         size: usual width and height [px], (2,).
-        larger_side: larger side over the last wing beats [px].
+        larger_side: largest of the larger sides [px].
     """
 
-    def __init__(self, size_s: float, beat_s: float) -> None:
-        """Create a history without boxes.
-
-        Args:
-            size_s: window of the usual size [s].
-            beat_s: window of the larger side [s].
-        """
-        self._size_s, self._beat_s = size_s, beat_s
-        self._boxes: deque[_Sides] = deque()
+    def __init__(self, span_s: float) -> None:
+        """Create a history without boxes, over a window of time [s]."""
+        self._span_s = span_s
+        self._boxes: deque[tuple[float, tuple[float, float], bool]] = deque()  # time, size, whether it is clipped
         self.size: Array = np.zeros(2)
         self.larger_side = 0.0
 
-    def add(self, t: float, width: float, height: float, clipped: bool) -> None:
-        """Add a box and update the sizes.
-
-        Args:
-            t: time of the frame [s].
-            width: width of the box [px].
-            height: height of the box [px].
-            clipped: whether the image's border cuts the box.
-        """
+    def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
+        """Add a box, see `Trail.add`, and update the sizes."""
         boxes = self._boxes
-        boxes.append(_Sides(t, width, height, clipped))
-        while boxes[0].t < t - max(self._size_s, self._beat_s):
+        boxes.append((t, size, clipped))
+        while boxes[0][0] < t - self._span_s:
             boxes.popleft()
         # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones.
-        recent = [box for box in boxes if box.t >= t - self._size_s]
-        whole = [box for box in recent if not box.clipped]
-        middle = statistics.median if whole else max
-        sides = [box.width for box in whole or recent], [box.height for box in whole or recent]
-        self.size = np.array([middle(each) for each in sides])
-        recent = [box for box in boxes if box.t >= t - self._beat_s]
-        beat = [box for box in recent if not box.clipped] or recent
-        self.larger_side = _quantile([max(box.width, box.height) for box in beat], BEAT_PART)
-
-
-@dataclass(frozen=True, slots=True)
-class _Sides:
-    """Width and height of a box at a time [s], and whether the image's border cuts it."""
-
-    t: float
-    width: float
-    height: float
-    clipped: bool
+        whole = [sides for _, sides, is_cut in boxes if not is_cut]
+        counted, middle = (whole, statistics.median) if whole else ([sides for _, sides, _ in boxes], max)
+        self.size = np.array([middle(lengths) for lengths in zip(*counted, strict=True)])
+        self.larger_side = _quantile([max(sides) for sides in counted], BEAT_PART)
 
 
 class Trail:
@@ -207,7 +117,8 @@ class Trail:
         """
         self._span_s = span_s
         self._extents = image_size or (None, None)
-        self._boxes: deque[_Place] = deque()
+        # Time [s] and edges of each box, and the length of the step to it [px].
+        self._boxes: deque[tuple[float, tuple[Edges, Edges], float]] = deque()
 
     def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
         """Add a box.
@@ -219,9 +130,9 @@ class Trail:
             clipped: whether the image's border cuts the box.
         """
         across, down = (_edges(*of, clipped) for of in zip(center, size, self._extents, strict=True))
-        step = _common_motion([self._boxes[-1].edges], [(across, down)]) if self._boxes else 0.0
-        self._boxes.append(_Place(t, (across, down), step))
-        while self._boxes[0].t < t - self._span_s:
+        step = _common_motion([self._boxes[-1][1]], [(across, down)]) if self._boxes else 0.0
+        self._boxes.append((t, (across, down), step))
+        while self._boxes[0][0] < t - self._span_s:
             self._boxes.popleft()
 
     def travel(self) -> float:
@@ -230,28 +141,19 @@ class Trail:
         Both edges of a moving target move the same way. A cloud or a shadow that drifts slowly behind others grows,
         shrinks and falls apart, which moves its centre, while an edge or two stay.
         """
-        edges = [box.edges for box in self._boxes]
-        count = max(1, min(ENDS, int(END_PART * len(edges))))
+        _, edges, steps = zip(*self._boxes, strict=True)
+        count = max(1, min(3, len(edges) // 3))  # medians of three, because outlines flicker
         way = _common_motion(edges[:count], edges[-count:])
-        longest = max((box.step for box in islice(self._boxes, 1, None)), default=0.0)
+        longest = max(steps[1:], default=0.0)
         return way if longest <= max(LARGEST_STEP * way, LEAST_JUMP_PX) else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """Edges of a box along u and v at a time [s], and the length of the step to it [px]."""
-
-    t: float
-    edges: tuple[Edges, Edges]
-    step: float
-
-
 def _edges(center: float, size: float, extent: int | None, clipped: bool) -> Edges:
-    """Low and high edge of a box along one axis [px]; nan for an edge at or beyond the border of a clipped box."""
+    """Low and high edge of a box along one axis [px]; nan for that of a clipped box in the outermost pixel."""
     low, high = center - size / 2, center + size / 2
     if not clipped or extent is None:
         return low, high
-    return low if low > BORDER_PX else math.nan, high if high < extent - 1 - BORDER_PX else math.nan
+    return low if low > 0.5 else math.nan, high if high < extent - 1.5 else math.nan
 
 
 def _common_motion(before: Sequence[tuple[Edges, Edges]], after: Sequence[tuple[Edges, Edges]]) -> float:
@@ -313,78 +215,65 @@ class TrackingSettings:
     """Settings of the image filter, of a track's life cycle and of the association.
 
     Attributes:
-        acceleration_px: typical acceleration in the image [px/s^2].
-        manoeuvre_s: time constant of the acceleration [s]; acceleration_px^2 manoeuvre_s is the process noise.
+        process_noise: spectral density of the white acceleration in the image [px^2/s^3].
         noise_px: standard deviation of a detection's centre, the part independent of its size [px].
         noise_of_size: the part proportional to the box's side, from moving limbs and wings.
         speed_px: standard deviation of a new track's speed [px/s].
         confirm_hits: fewest detections of a confirmed track.
-        confirm_s: least age of a confirmed track [s].
         confirm_travel: least travel of a confirmed track, in larger sides of its box; 0 if it may stand still.
         travel_s: window of that travel [s].
         confirm_score: least average score of a confirmed track, the last detections weighted most; 0 for any.
         score_s: time constant of the average score [s]; a new track begins at 0.
-        doubt_score: average score below which a confirmed track ends.
         lose_s: time without a detection after which a confirmed track ends [s]; its age if that is less.
         drop_s: time without a detection after which an unconfirmed track ends [s].
-        size_s: window of the size's median [s].
-        beat_s: window of the largest size, some two wing beats [s].
+        size_s: window of the size's median and maximum, some two wing beats [s].
         gate: gate on the squared Mahalanobis distance of place and size, 99.9 % of a chi-square with three degrees of
             freedom.
         size_sigma: standard deviation of the logarithm of a box's side: wings, limbs and occluders make it half or
             twice as large. A twig that appears where a bird has gone behind a tree is smaller still.
-        least_score: scores below 0.5 count as a likelihood ratio, down to this score.
         newcomers_hz: rate of new objects anywhere in the image [1/s]. A detection must more likely be the missing
             target than a new object, because after 0.8 s the gate reaches over 250 px. Real films of birds and people
             have up to 4 a second; below 1, tracks jump to other targets, and from 8 on, hidden birds are not found
             again.
         overlap_enough: overlap from which a box may belong to a track even outside the gate: the target merged with
             something else.
-        overlap_bonus: reduction of the cost for perfect overlap, in squared Mahalanobis distance.
         covered: a detection that covers this part of a track's predicted box explains the track, even if another has
             won it.
         most_detections: most detections of a frame that are used: snow, rain or flicker must not delay the next frame.
             Real films of birds and of a dozen people have up to 10.
     """
 
-    acceleration_px: float = 150.0
-    manoeuvre_s: float = 0.3
+    process_noise: float = 6750.0
     noise_px: float = 0.4
     noise_of_size: float = 0.06
     speed_px: float = 120.0
     confirm_hits: int = 4
-    confirm_s: float = 0.15
     confirm_travel: float = 0.0
     travel_s: float = 2.0
     confirm_score: float = 0.0
     score_s: float = 0.3
-    doubt_score: float = 0.0
     lose_s: float = 0.8
     drop_s: float = 0.13
     size_s: float = 0.6
-    beat_s: float = 0.5
     gate: float = 16.3
     size_sigma: float = 0.5
-    least_score: float = 0.01
     newcomers_hz: float = 2.0
     overlap_enough: float = 0.3
-    overlap_bonus: float = 4.0
-    covered: float = 0.6
+    covered: float = 0.5
     most_detections: int = 100
 
 
-# Part of a box's side by which its centre jitters with limbs and wings, by the target's motion model; and the settings
-# that differ from the defaults, by the detector. A small target may hover, so its score decides and not its travel.
-JITTER = {"standing": 0.04, "walking": 0.04, "flying": 0.2, "general": 0.06}
-FLYING_ACCELERATION_PX = 250.0
+# Settings that differ from the defaults, by the target's motion model and by the detector. The centre of a box jitters
+# with limbs and wings. A small target may hover, so its score decides and not its travel.
+BY_MOTION: Mapping[str, Mapping[str, float]] = {
+    "standing": {"noise_of_size": 0.04},
+    "walking": {"noise_of_size": 0.04},
+    "flying": {"noise_of_size": 0.2, "process_noise": 18750.0},
+    "general": {},
+}
 BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
     "colour": {"noise_px": 0.2, "noise_of_size": 0.01},
-    "speck": {
-        "acceleration_px": FLYING_ACCELERATION_PX,
-        "noise_of_size": 0.2,
-        "confirm_score": 0.5,
-        "doubt_score": 0.2,
-    },
+    "speck": {"confirm_score": 0.5},
     "motion": {"confirm_travel": 0.5},
     "mog2": {"confirm_travel": 0.5},
 }
@@ -401,12 +290,8 @@ def tracking_settings(target: TargetProfile, *, external: bool = False) -> Track
         target: target profile.
         external: whether the detections come from an external detector, and not from the one that the profile names.
     """
-    by_motion = {"noise_of_size": JITTER[target.motion]}
-    if target.motion == "flying":
-        by_motion["acceleration_px"] = FLYING_ACCELERATION_PX
-    if not external:
-        by_motion.update(BY_DETECTOR.get(target.detector, {}))
-    return TrackingSettings(**by_motion)  # type: ignore[arg-type]
+    by_detector = {} if external else BY_DETECTOR.get(target.detector, {})
+    return TrackingSettings(**{**BY_MOTION[target.motion], **by_detector})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -426,6 +311,7 @@ class Track:
         score: score of the last detection, 0 to 1.
         box: the last detection.
         shared: whether that detection covers other tracks too, so that it only bounds this one's place.
+        seen_t: time of that detection [s].
     """
 
     id: int
@@ -440,6 +326,7 @@ class Track:
     score: float
     box: Measurement
     shared: bool = False
+    seen_t: float = -math.inf
 
 
 class LiveTrack:
@@ -461,19 +348,26 @@ class LiveTrack:
         self.missed = 0
         self.confirmed = False
         self.mean_score = 0.0
-        self._sizes = SizeHistory(settings.size_s, settings.beat_s)
+        self._sizes = SizeHistory(settings.size_s)
         # Travel is needed until the track is confirmed, and only if the settings ask for it.
         self._trail = Trail(settings.travel_s, image_size) if settings.confirm_travel else None
         self._add_box(detection)
-        process_noise = settings.acceleration_px**2 * settings.manoeuvre_s
-        self.filter = ImageFilter(
-            detection.center_px.tolist(), self.variance(detection), settings.speed_px**2, process_noise
-        )
+        self._axes = [
+            AxisFilter(at, variance, settings.speed_px**2)
+            for at, variance in zip(detection.center_px.tolist(), self.variance(detection), strict=True)
+        ]
 
     @property
     def center(self) -> tuple[float, float]:
         """Centre (u, v) [px]."""
-        return self.filter.center
+        u, v = self._axes
+        return u.position, v.position
+
+    @property
+    def center_variance(self) -> tuple[float, float]:
+        """Variances of the centre along u and v, which are uncorrelated [px^2]."""
+        u, v = self._axes
+        return u.covariance.position, v.covariance.position
 
     @property
     def size(self) -> Array:
@@ -482,7 +376,8 @@ class LiveTrack:
 
     def predict(self, t: float) -> None:
         """Predict the track at time ``t`` [s]."""
-        self.filter.predict(t - self.t)
+        for axis in self._axes:
+            axis.predict(t - self.t, self.settings.process_noise)
         self.t = t
 
     def correct(self, detection: Measurement) -> None:
@@ -497,7 +392,6 @@ class LiveTrack:
             settings = self.settings
             self.confirmed = (
                 self.hits >= settings.confirm_hits
-                and self.t - self.born >= settings.confirm_s
                 and self.mean_score >= settings.confirm_score
                 and self._has_travelled()
             )
@@ -519,30 +413,38 @@ class LiveTrack:
         return min(self.settings.lose_s, self.seen - self.born)
 
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
-        """Whether the track ends: no detection for too long, outside the image, or a score that is too low."""
+        """Whether the track ends: no detection for too long, or outside the image."""
         if self.missed and image_size is not None:
             (u, v), (width, height) = self.center, image_size
             if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
                 return True
-        if self.confirmed and self.mean_score < self.settings.doubt_score:
-            return True
         return self.t - self.seen > self.patience_s
 
     def track(self) -> Track:
         """Give the state as a frozen `Track`."""
+        u, v = self._axes
+        P, Q = u.covariance, v.covariance
         return Track(
             id=self.number,
             t=self.t,
             confirmed=self.confirmed,
             missed=self.missed,
             center_px=np.array(self.center),
-            velocity_px=np.array(self.filter.velocity),
+            velocity_px=np.array([u.velocity, v.velocity]),
             size_px=self.size.copy(),
             larger_side_px=self._sizes.larger_side,
-            covariance=self.filter.covariance,
+            covariance=np.array(
+                [
+                    [P.position, 0.0, P.cross, 0.0],
+                    [0.0, Q.position, 0.0, Q.cross],
+                    [P.cross, 0.0, P.velocity, 0.0],
+                    [0.0, Q.cross, 0.0, Q.velocity],
+                ]
+            ),
             score=self.detection.score,
             box=self.detection,
             shared=self.shared,
+            seen_t=self.seen,
         )
 
     def variance(self, detection: Measurement) -> list[float]:
@@ -557,9 +459,9 @@ class LiveTrack:
     def _add_box(self, detection: Measurement) -> None:
         """Add a box to the histories."""
         (u, v), (width, height) = detection.center_px.tolist(), detection.size_px.tolist()
-        self._sizes.add(self.t, width, height, detection.clipped)
-        if self._trail is not None:
-            self._trail.add(self.t, (u, v), (width, height), detection.clipped)
+        for history in (self._sizes, self._trail):
+            if history is not None:
+                history.add(self.t, (u, v), (width, height), detection.clipped)
 
     def _has_travelled(self) -> bool:
         """Whether the track has travelled far enough to be confirmed."""
@@ -569,7 +471,8 @@ class LiveTrack:
 
     def _measure(self, center: Sequence[float], variance: Sequence[float]) -> None:
         """Correct with a measured centre [px] and its variances [px^2], (2,) each."""
-        self.filter.correct(center, variance)
+        for axis, at, var in zip(self._axes, center, variance, strict=True):
+            axis.correct(at, var)
         self.seen = self.t
         self.missed = 0
 

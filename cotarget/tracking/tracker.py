@@ -5,8 +5,6 @@ Each track is filtered by `cotarget.tracking.track`. The source of the numbers: 
 """
 
 import math
-import statistics
-from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,10 +25,6 @@ from cotarget.tracking.track import (
 __all__ = ["Measurement", "Track", "Tracker", "TrackingSettings", "tracking_settings"]
 # Cost of pairs that must not be matched; no assignment inside the gate reaches it.
 IMPOSSIBLE = 1e6
-# Area of an image in which new objects appear at `newcomers_hz`; a smaller image has no more per pixel [px^2].
-LEAST_AREA_PX = 640 * 512
-# Intervals whose median is the usual time between frames, and its value before the second frame [s].
-INTERVALS, FIRST_INTERVAL_S = 5, 1.0
 
 
 class Tracker:
@@ -48,7 +42,7 @@ class Tracker:
         self._tracks: list[LiveTrack] = []
         self._next_id = 1
         self._t: float | None = None
-        self._intervals = deque([FIRST_INTERVAL_S], INTERVALS)
+        self._interval = self._settings.lose_s  # between the last two frames [s]
 
     @property
     def tracks(self) -> list[Track]:
@@ -75,10 +69,7 @@ class Tracker:
         detections = self._most_useful(detections)
         matches: dict[int, int] = {}
         merged: dict[int, int] = {}
-        if len(self._tracks) == len(detections) == 1:
-            if _belongs(self._tracks[0], detections[0], self._image_size):
-                matches = {0: 0}
-        elif self._tracks and detections:
+        if self._tracks and detections:
             pairs = _Pairs(self._tracks, detections, self._image_size)
             matches = _assign(pairs)
             merged = _merged(pairs, matches)
@@ -97,15 +88,14 @@ class Tracker:
     def _begin(self, t: float) -> None:
         """Predict all tracks to a frame's time and end those that did not survive a gap between frames.
 
-        The search area grows with the gap, until any detection would match. The usual time between frames is no such
-        gap, even for a track that lives no longer.
+        The search area grows with the gap, until any detection would match. The time between the last two frames is no
+        such gap, even for a track that lives no longer.
         """
-        usual = statistics.median(self._intervals)
-        self._tracks = [state for state in self._tracks if t - state.seen <= state.patience_s + usual]
+        self._tracks = [state for state in self._tracks if t - state.seen <= state.patience_s + self._interval]
         for state in self._tracks:
             state.predict(t)
         if self._t is not None and t > self._t:
-            self._intervals.append(t - self._t)
+            self._interval = t - self._t
         self._t = t
 
     def _most_useful(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
@@ -141,10 +131,9 @@ class _Pairs:
     """Comparison of every track with every detection, as arrays (tracks, detections).
 
     Attributes:
-        distance: squared distance of place (Mahalanobis) and of size, in variances, plus the cost of a low score.
+        distance: squared distance of place (Mahalanobis) and of size, in variances.
         log_volume: logarithm of the determinant of the innovation covariance.
         covered: part of the track's box that the detection covers, 0 to 1.
-        overlap: intersection over union of the boxes, 0 to 1.
         settings: settings of the tracker.
         confirmed: whether each track is confirmed.
         possible: whether each detection may belong to each track.
@@ -159,7 +148,7 @@ class _Pairs:
         """Compare tracks and detections, at least one of each; new objects need the image's (width, height) [px]."""
         self.confirmed = [state.confirmed for state in states]
         (at, size), (center, extent) = _boxes_of(states), _boxes(detections)
-        spread = np.array([state.filter.center_variance for state in states])[:, None]
+        spread = np.array([state.center_variance for state in states])[:, None]
         cut = np.array([detection.clipped for detection in detections], dtype=bool)
         lacks = missing(size[:, None], extent)
         self.settings = settings = states[0].settings
@@ -171,15 +160,13 @@ class _Pairs:
         resized = np.where(cut, np.where(known, np.maximum(resized, 0.0), 0.0), resized)
         off = (center - at[:, None]) ** 2 / spread
         self.distance: Array = off[..., 0] + off[..., 1] + resized**2
-        score = np.array([min(max(detection.score, settings.least_score), 0.5) for detection in detections])
-        self.distance += 2 * np.log((1 - score) / score)
         self.log_volume: Array = np.log(_area(spread))
         shared = _shared(at, size, center, extent)
         self.covered: Array = shared / own
-        self.overlap: Array = shared / (own + other - shared)
+        overlap = shared / (own + other - shared)
+        new_object = self.distance + self.log_volume > _least_likely(states, image_size)
         # A target whose box merged with another still overlaps its track.
-        near = (self.distance <= settings.gate) & (self.distance + self.log_volume <= _least_likely(states, image_size))
-        self.possible = near | (self.overlap > settings.overlap_enough)
+        self.possible = ((self.distance <= settings.gate) & ~new_object) | (overlap > settings.overlap_enough)
 
 
 def _least_likely(states: Sequence[LiveTrack], image_size: tuple[int, int] | None) -> Array:
@@ -190,7 +177,7 @@ def _least_likely(states: Sequence[LiveTrack], image_size: tuple[int, int] | Non
     """
     limits = np.full((len(states), 1), np.inf)
     if image_size is not None:
-        density = states[0].settings.newcomers_hz / max(math.prod(image_size), LEAST_AREA_PX)
+        density = states[0].settings.newcomers_hz / math.prod(image_size)
         for i, state in enumerate(states):
             if state.missed:
                 limits[i] = -2 * math.log(2 * math.pi * density * (state.t - state.seen))
@@ -216,26 +203,6 @@ def _shared(at: Array, size: Array, center: Array, extent: Array) -> Array:
     return _area(np.maximum(0.0, high - low))
 
 
-def _belongs(state: LiveTrack, detection: Measurement, image_size: tuple[int, int] | None) -> bool:
-    """Whether a single detection may belong to a single track; the result of `_Pairs`, mostly in a fifth of the time.
-
-    If the boxes overlap enough, they match whatever their distance is.
-    """
-    if _overlap(state, detection) > state.settings.overlap_enough:
-        return True
-    return bool(_Pairs([state], [detection], image_size).possible[0, 0])
-
-
-def _overlap(state: LiveTrack, detection: Measurement) -> float:
-    """Intersection over union of a track's predicted box and a detection's, 0 to 1."""
-    shared = own = other = 1.0
-    boxes = state.center, state.size.tolist(), detection.center_px.tolist(), detection.size_px.tolist()
-    for at, side, center, extent in zip(*boxes, strict=True):
-        low, high = max(at - side / 2, center - extent / 2), min(at + side / 2, center + extent / 2)
-        shared, own, other = shared * max(0.0, high - low), own * side, other * extent
-    return shared / (own + other - shared)
-
-
 def _area(sides: Array) -> Array:
     """Area or product of two sides, (..., 2) to (...)."""
     return np.asarray(sides[..., 0] * sides[..., 1])
@@ -247,8 +214,7 @@ def _assign(pairs: _Pairs) -> dict[int, int]:
     Confirmed tracks are matched first: a coasting track knows its target's place badly, and a new track begun there
     meanwhile knows it well, yet the detection is the old target, found again.
     """
-    bonus = pairs.settings.overlap_bonus * pairs.overlap
-    cost = np.where(pairs.possible, pairs.distance + pairs.log_volume - bonus, IMPOSSIBLE)
+    cost = np.where(pairs.possible, pairs.distance + pairs.log_volume, IMPOSSIBLE)
     matches: dict[int, int] = {}
     for confirmed in (True, False):
         group = [i for i, each in enumerate(pairs.confirmed) if each == confirmed]

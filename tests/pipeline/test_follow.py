@@ -47,17 +47,17 @@ def frames_until(seconds):
 
 
 def test_states_from_searching_to_lost_and_back():
-    """Confirmed after 0.15 s; out of sight: coasts for 0.4 s, zooms out, forgets after 0.8 s."""
+    """Confirmed by the fourth detection; out of sight: coasts for 0.4 s, zooms out, forgets after 0.8 s."""
     rig = FormulaRig()
     steps = run(rig, Seer(still, lambda t: 1.0 <= t < 3.0 or t >= 6.0), 8.0)
     last = 3.0 - FRAME_S
     expected = [
         (State.SEARCHING, 0.0),
-        (State.FOLLOWING, 1.0 + frames_until(0.15)),
+        (State.FOLLOWING, 1.0 + 3 * FRAME_S),
         (State.COASTING, 3.0),
         (State.LOST, last + frames_until(0.4)),
         (State.SEARCHING, last + frames_until(0.8)),
-        (State.FOLLOWING, 6.0 + frames_until(0.15)),
+        (State.FOLLOWING, 6.0 + 3 * FRAME_S),
     ]
     found = spans(steps)
     assert [state for state, _ in found] == [state for state, _ in expected]
