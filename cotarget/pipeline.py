@@ -9,6 +9,7 @@ import enum
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from numbers import Real
 from typing import NamedTuple
 
@@ -44,18 +45,15 @@ from cotarget.targeting import Aim, target_implausibility
 from cotarget.tracking.track import Track, TrackingSettings, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
-# Longest wait for a zoom frame, except for the first [s].
-ZOOM_WAIT_S = 2e-3
-# Frames of the fixed camera may repeat, or jump in time, for this long, and are read again this often [s]. They are
-# not acted on, and the watchdog halts a moving head meanwhile.
-REPEATED_S, AGAIN_S = 0.5, 5e-3
-# Time after which a zoom camera that repeats a frame is reported [s].
-ZOOM_STALE_S = 0.5
-# Time after which it is an error [s]: longer than the 5 s for which a driver tries to reconnect to its camera.
+# Longest wait for a zoom frame, except for the first, and pause after a fixed frame that repeats or jumps in time [s].
+WAIT_S = 2e-3
+# A fixed camera whose frames repeat or jump in time ends the run after this long, and a zoom camera that shows nothing
+# new is reported [s]. Such frames are not acted on, and the watchdog halts a moving head meanwhile.
+STALE_S = 0.5
+# Time without a new zoom frame after which the run ends [s]: longer than the 5 s for which a driver tries to reconnect.
 GONE_S = 10.0
-# Time after which an image that stays the same to the last bit is reported [s]: images of a live camera have noise.
-FROZEN_S = 1.0
-ROWS = 16  # every 16th row is compared first, which shows most differences
+# Longest interval that counts as the period of commands [s]; a longer one was a gap between frames.
+LONGEST_INTERVAL_S = 0.2
 
 
 class FrameSource:
@@ -84,7 +82,7 @@ class FrameSource:
         self.interval, self.zoom_is_new = math.inf, False
 
     def read_fixed(self) -> Frame:
-        """Wait for the next frame of the fixed camera; skip repeated or impossible ones for a while.
+        """Wait for the next frame of the fixed camera; skip repeated or impossible ones for `STALE_S`.
 
         Raises:
             StaleFrameError: no frame came, or none that is newer and not from the future for too long.
@@ -97,11 +95,11 @@ class FrameSource:
             except StaleFrameError as error:
                 now = self._clock.now()
                 if not self._fixed_fault:
-                    until = now + REPEATED_S
+                    until = now + STALE_S
                 if self._fixed_frame is None or now - self._read_t >= READ_TIMEOUT_S or not now < until:
                     raise
                 self._fixed_fault = str(error)
-                self._clock.sleep_until(now + AGAIN_S)
+                self._clock.sleep_until(now + WAIT_S)
                 timeout = until - now
 
     def _next_fixed(self, timeout: float, until: float) -> Frame:
@@ -134,7 +132,7 @@ class FrameSource:
         """
         before, self._zoom_fault = self._zoom_frame, ""
         try:
-            frame = self._zoom.read() if before is None else self._zoom.read(timeout=ZOOM_WAIT_S)
+            frame = self._zoom.read() if before is None else self._zoom.read(timeout=WAIT_S)
         except StaleFrameError as error:
             if before is None:
                 raise
@@ -153,15 +151,19 @@ class FrameSource:
         return before
 
     def faults(self) -> list[str]:
-        """Describe what is wrong with the newest frames, one message each."""
+        """Describe what is wrong with the newest frames, one message each.
+
+        Images that stay the same to the last bit for `READ_TIMEOUT_S` are reported, because those of a live camera have
+        noise.
+        """
         found = []
         if self._fixed_fault:
             found.append(f"{self._fixed_fault}; this one is {self.interval:.2f} s after the last")
-        if (same := self._fixed_t - self._fixed_changed_t) > FROZEN_S:
+        if (same := self._fixed_t - self._fixed_changed_t) > READ_TIMEOUT_S:
             found.append(f"the fixed camera has shown the same picture for {same:.1f} s")
-        if self._zoom_fault or self._fixed_t - self._zoom_t > ZOOM_STALE_S:
+        if self._zoom_fault or self._fixed_t - self._zoom_t > STALE_S:
             found.append(self._describe_stale_zoom())
-        elif (same := self._fixed_changed_t - self._zoom_changed_t) > FROZEN_S:
+        elif (same := self._fixed_changed_t - self._zoom_changed_t) > READ_TIMEOUT_S:
             found.append(f"the zoom camera has shown the same picture for {same:.1f} s")
         return found
 
@@ -187,12 +189,8 @@ def _check_size(frame: Frame, camera: Camera, name: str) -> None:
 
 
 def _is_same(a: Image, b: Image) -> bool:
-    """Whether two images are the same to the last bit."""
-    return a is b or (np.array_equal(a[::ROWS], b[::ROWS]) and np.array_equal(a, b))
-
-
-# Longest interval that counts as the period of commands [s]; a longer one was a gap between frames.
-LONGEST_INTERVAL_S = 0.2
+    """Whether two images are the same to the last bit; those of a live camera differ in the first row already."""
+    return a is b or (np.array_equal(a[0], b[0]) and np.array_equal(a, b))
 
 
 class State(enum.StrEnum):
@@ -403,7 +401,6 @@ class _Run:
         self._unreachable: set[int] = set()  # ids of tracks that could not be aimed at
         self._selector = selector
         self._selector.start(rig.fixed.size)
-        self._seen_t: dict[int, float] = {}  # time at which each track was last seen
         self._index = 0
 
     def step(self) -> Step:
@@ -447,7 +444,6 @@ class _Run:
 
     def _estimate(self, frame: Frame, tracks: list[Track]) -> tuple[Frame, ZoomMeasurement | None]:
         """Update the 3D estimates with both cameras' newest frames; return the zoom frame and what it measured."""
-        self._seen_t = {each.id: self._seen_t.get(each.id, frame.t) if each.missed else frame.t for each in tracks}
         favoured = {track.id for track in tracks if self._selector.favours(track)}
         self._fusion.update_fixed(frame, tracks, self._detector.mask, favoured)
         self._read_states()
@@ -499,12 +495,12 @@ class _Run:
             interval: time from one command to the next [s].
         """
         self._fusion.count_seen_well(followed, interval, self._rig.zoom.focal_range[1])
-        seen_t = self._seen_t[followed.id]
+        predict, seen_t = partial(self._fusion.estimate, followed.id), followed.seen_t
         if t - seen_t > self._settings.zoom_out_after_s:
-            reason, aim = self._follow_unseen(followed, seen_t, interval)
+            reason, aim = self._follow_unseen(predict, seen_t, interval)
             return _Outcome(State.LOST, (f"out of sight for {t - seen_t:.1f} s", reason), aim)
         try:
-            drive = self._controller.drive(self._predict(followed), seen_t, interval, shape=shape_of(followed))
+            drive = self._controller.drive(predict, seen_t, interval, shape=shape_of(followed))
         except UnreachableError as error:
             self._unreachable.add(followed.id)
             return _Outcome(State.UNREACHABLE, (str(error),))
@@ -514,16 +510,12 @@ class _Run:
         state = State.UNCONFIRMED if self._fusion.search.is_unconfirmed else State.FOLLOWING
         return _Outcome(state, reasons, drive.aim)
 
-    def _follow_unseen(self, followed: Track, seen_t: float, interval: float) -> tuple[str, Aim | None]:
+    def _follow_unseen(self, predict: Predict, seen_t: float, interval: float) -> tuple[str, Aim | None]:
         """Point where a target out of sight should be; return what the head does, and the aim."""
         try:
-            aim = self._controller.search(self._predict(followed), seen_t, interval)
+            aim = self._controller.search(predict, seen_t, interval)
         except UnreachableError as error:
             return f"the head waits: {error}", None
         if aim is None:
             return "the head waits: where it is by now is not known well enough", None
         return "looked for where it should be", aim
-
-    def _predict(self, followed: Track) -> Predict:
-        """Give the target's estimate as a function of time."""
-        return lambda t: self._fusion.estimate(followed.id, t)
