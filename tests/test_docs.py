@@ -55,6 +55,7 @@ def test_the_experiment_that_the_documentation_adds_runs(monkeypatch):
     assert experiment.missed(experiment.summarise(rows)) == []
 
 
+@pytest.mark.docs  # it needs the packages of the docs build
 def test_reference_lists_options_keys_and_the_end_of_help():
     made = runpy.run_path(str(ROOT / "docs/make_reference.py"))
     commands, keys = made["command_line"](), made["configuration"]()
