@@ -215,7 +215,8 @@ class CaptureRecorder:
 
     def coverage(self, camera: CameraName, nominal_px: float | None = None) -> Coverage:
         """Count the corners that a camera has seen so far, at one nominal focal length [px] or at any."""
-        found = Coverage((self.rig.fixed if camera == "fixed" else self.rig.zoom).size, misses=self.misses)
+        misses = self.misses if camera == "fixed" else []
+        found = Coverage((self.rig.fixed if camera == "fixed" else self.rig.zoom).size, misses=misses)
         for view in self.views:
             if view.camera == camera and (nominal_px is None or same_focal(view, nominal_px)):
                 found.add(view.corners_px)

@@ -309,6 +309,7 @@ def see_stops(
     report: Callable[[str], None],
 ) -> BundleModel:
     """Take views at all zoom samples but the first, and return the model with those that were seen."""
+    recorder.misses.clear()  # near boards were missed while the model was rough; far ones may be seen there
     reachable = functools.partial(_reachable, recorder, model)
     only_fixed = replace(model, zoom_head=None)
     done = 0
