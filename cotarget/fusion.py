@@ -388,17 +388,16 @@ class TargetFusion:
         known = self._filters.get(number)
         return None if known is None else known.at(t)
 
-    def warnings(self, number: int, t: float) -> list[str]:
+    def warnings(self, number: int, estimate: Estimate | None) -> list[str]:
         """Describe what contradicts the nominal size of a target or the calibration.
 
         Args:
             number: id of the followed track.
-            t: time [s].
+            estimate: estimate of it at the time of the newest fixed frame.
 
         Returns:
             One sentence for each contradiction; empty if there is none.
         """
-        estimate = self.estimate(number, t)
         if estimate is None:
             return []
         found = []

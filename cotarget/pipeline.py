@@ -413,12 +413,8 @@ class _Run:
         followed = self._select(tracks)
         outcome = self._search(tracks) if followed is None else self._follow(followed, frame.t, interval)
         self._read_states()
-        warnings, estimate = [], None
-        if followed is not None:
-            warnings, estimate = (
-                self._fusion.warnings(followed.id, frame.t),
-                self._fusion.estimate(followed.id, frame.t),
-            )
+        estimate = None if followed is None else self._fusion.estimate(followed.id, frame.t)
+        warnings = [] if followed is None else self._fusion.warnings(followed.id, estimate)
         self._index += 1
         return Step(
             index=self._index - 1,

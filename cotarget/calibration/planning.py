@@ -113,15 +113,18 @@ POSES = 120  # candidate head poses for a placement
 SMALLEST_SPACING_PX = {"chessboard": 7.0, "charuco": 14.0}  # mean over the board, along its thinner direction
 
 
+Missed = tuple[Array, float]  # middle in the image [px], (2,), and depth [m] of a board that a camera did not see
+
+
 @dataclass(eq=False)
 class Coverage:
     """Corners seen in each cell of one camera's image, and boards that the camera did not see."""
 
     size: tuple[int, int]  # image size (width, height) [px]
     counts: Array = field(default_factory=lambda: np.zeros(GRID))  # number of corners in every cell, `GRID`
-    # middle in the image [px], (2,), and depth [m] of each board that was not seen, such as one behind a wall or
-    # below a floor; boards there at that depth or farther will not be seen either
-    misses: list[tuple[Array, float]] = field(default_factory=list)
+    # boards that were not seen, such as one behind a wall or below a floor; boards there at that depth or farther will
+    # not be seen either
+    misses: list[Missed] = field(default_factory=list)
 
     def add(self, corners_px: Array) -> None:
         """Count corners (N, 2) [px]; nan does not count."""

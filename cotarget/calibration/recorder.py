@@ -57,8 +57,6 @@ class CaptureRecorder:
     directory: Path | None = None  # folder for the captures; None to keep the corners only
     views: list[View] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)  # images in which a board was expected but not found
-    # middle [px], (2,), and depth [m] of each board that the fixed camera did not see
-    misses: list[tuple[Array, float]] = field(default_factory=list)
     number: int = -1  # number of the present placement
     _captures: list[Capture] = field(default_factory=list)
     _still_since: float = 0.0
@@ -215,8 +213,7 @@ class CaptureRecorder:
 
     def coverage(self, camera: CameraName, nominal_px: float | None = None) -> Coverage:
         """Count the corners that a camera has seen so far, at one nominal focal length [px] or at any."""
-        misses = self.misses if camera == "fixed" else []
-        found = Coverage((self.rig.fixed if camera == "fixed" else self.rig.zoom).size, misses=misses)
+        found = Coverage((self.rig.fixed if camera == "fixed" else self.rig.zoom).size)
         for view in self.views:
             if view.camera == camera and (nominal_px is None or same_focal(view, nominal_px)):
                 found.add(view.corners_px)

@@ -40,6 +40,7 @@ from cotarget.calibration.joint import (
 from cotarget.calibration.model import BundleModel, CameraName, Rejected, View
 from cotarget.calibration.planning import (
     Coverage,
+    Missed,
     PredictedAccuracy,
     distance,
     facing_board,
@@ -309,15 +310,15 @@ def see_stops(
     report: Callable[[str], None],
 ) -> BundleModel:
     """Take views at all zoom samples but the first, and return the model with those that were seen."""
-    recorder.misses.clear()  # near boards were missed while the model was rough; far ones may be seen there
     reachable = functools.partial(_reachable, recorder, model)
     only_fixed = replace(model, zoom_head=None)
+    hidden: list[Missed] = []  # without those of near boards, missed while the model was rough
     done = 0
     for _ in range(ATTEMPTS * placements):
         if done == placements:
             break
         share = FARTHEST_SHARE - (FARTHEST_SHARE - NEAREST_SHARE) * done / max(placements - 1, 1)
-        coverage = {"fixed": recorder.coverage("fixed")}
+        coverage = {"fixed": replace(recorder.coverage("fixed"), misses=hidden)}
         planned = plan_placements(
             only_fixed, recorder.board, coverage, [share], rng, shared=False, margin_px=BORDER_PX, accept=reachable
         )
@@ -326,7 +327,7 @@ def see_stops(
         recorder.present(planned[0])
         fixed_view = recorder.see_fixed()
         if fixed_view is None:
-            recorder.misses.append(where_in(model.fixed.lens, recorder.board, planned[0]))
+            hidden.append(where_in(model.fixed.lens, recorder.board, planned[0]))
             continue
         done += 1
         for i, stop in enumerate(stops[1:], start=2):
@@ -508,12 +509,13 @@ def _cover(
 ) -> BundleModel:
     """Take views of placements that cover both images, from several head poses each, and refine the rough model."""
     predicted: PredictedAccuracy | None = None
+    hidden: list[Missed] = []
     misses = done = 0
     while recorder.number + 1 < placements:
         # After a miss the rough model's distortion is wrong near the border, so the next placement keeps farther away.
         margin = min((ROUGH_MARGIN if done < REFIT_ALWAYS else FINE_MARGIN) * MARGIN_GROWTH**misses, WIDEST_MARGIN)
         recorder.turn(0.0, 0.0)
-        requested = _next_placement(recorder, model, rng, margin, predicted)
+        requested = _next_placement(recorder, model, hidden, rng, margin, predicted)
         recorder.present(requested)
         error = "" if predicted is None else f", predicted error {np.degrees(predicted.error()):.4f} degrees"
         report(f"board {recorder.number + 1} of {placements}{error}")
@@ -523,7 +525,7 @@ def _cover(
         if misses > MOST_MISSES:
             raise CalibrationError(f"the fixed camera lost the board: not seen {misses} times in a row")
         if fixed_view is None:
-            recorder.misses.append(where_in(model.fixed.lens, recorder.board, requested))
+            hidden.append(where_in(model.fixed.lens, recorder.board, requested))
             continue
         T = _see_from_everywhere(recorder, model, requested, fixed_view, margin, rng)
         done += 1
@@ -540,6 +542,7 @@ def _cover(
 def _next_placement(
     recorder: CaptureRecorder,
     model: BundleModel,
+    hidden: list[Missed],
     rng: np.random.Generator,
     margin: float,
     predicted: PredictedAccuracy | None,
@@ -549,7 +552,7 @@ def _next_placement(
     Before the accuracy can be predicted, it is the one that most head poses show.
     """
     board, limits, points = recorder.board, recorder.rig.head.limits, recorder.points
-    coverage = {"fixed": recorder.coverage("fixed"), "zoom": recorder.coverage("zoom")}
+    coverage = {"fixed": replace(recorder.coverage("fixed"), misses=hidden), "zoom": recorder.coverage("zoom")}
     margin_px = margin * model.fixed.size[0]
     shares = [preferred_share(recorder.number), *rng.uniform(size=CHOICES - 1)]
     candidates = plan_placements(model, board, coverage, shares[: CHOICES // 2], rng, shared=True, margin_px=margin_px)

@@ -165,8 +165,9 @@ def look(
         foreground = du**2 + dv**2 <= 1
     if detection.clipped:  # the hidden part may be as large again
         sigma = np.hypot(sigma, size / 2)
-    du, dv = np.abs(u - center[0]) - size[0] / 2, np.abs(v - center[1])[:, None] - size[1] / 2
-    around = np.clip(1 - np.maximum(du, dv) / margin, 0, 1)  # falls to 0 at the patch's border
+    # Distance from the box along each axis, negative inside [px].
+    beyond_u, beyond_v = np.abs(u - center[0]) - size[0] / 2, np.abs(v - center[1])[:, None] - size[1] / 2
+    around = np.clip(1 - np.maximum(beyond_u, beyond_v) / margin, 0, 1)  # falls to 0 at the patch's border
     weight = np.where(foreground, 1.0, settings.margin_weight * around).astype(np.float32)
     return FixedView(frame.t, body, sigma, size, patch, low.astype(float), weight, whitening)
 

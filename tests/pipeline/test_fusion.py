@@ -373,12 +373,12 @@ def test_a_target_not_found_where_expected_is_reported_and_then_searched_farther
     """Its nominal size is 15 % too small: at 10 m, 0.4 m beside, that is 21 px of 3000."""
     fusion, found, t = followed(Finder(gate=9.0), wrong=1.15, frames=UNFOUND)
     assert found[:-2] == [None] * (UNFOUND - 2)
-    (text,) = fusion.warnings(1, t)
+    (text,) = fusion.warnings(1, fusion.estimate(1, t))
     assert text.startswith("for 1.5 s not found where the zoom camera should show it")
-    assert fusion.warnings(2, t) == []
+    assert fusion.warnings(2, fusion.estimate(2, t)) == []
     fusion, found, t = followed(Finder(gate=9.0), wrong=1.15, frames=UNFOUND + 30)
     assert all(each is not None for each in found[-20:])
-    (text,) = fusion.warnings(1, t)
+    (text,) = fusion.warnings(1, fusion.estimate(1, t))
     assert text.startswith("the nominal size or the calibration seems wrong: both views make it 0.2")
 
 
@@ -395,14 +395,14 @@ def test_a_target_that_the_zoom_image_cannot_show_causes_no_warning():
     """It is outside the zoom image, or hidden in the fixed image too."""
     outside = (BASELINE + 2.0, 0.0, 10.0)  # 600 px beside the middle
     fusion, _, t = followed(Finder(gate=-1.0), outside, frames=100)
-    assert fusion.warnings(1, t) == []
+    assert fusion.warnings(1, fusion.estimate(1, t)) == []
     fusion, _, _ = followed(Finder(gate=-1.0), frames=5)
     for i in range(5, 60):
         t = i * FRAME_S
         show(fusion, t, [track(1, box_at(*X), t, missed=i)])
         report(fusion, t)
         fusion.update_zoom(Frame(IMAGE, t), t)
-    assert fusion.warnings(1, t) == []
+    assert fusion.warnings(1, fusion.estimate(1, t)) == []
 
 
 # ---------------------------------------------------------------- cameras with different times
@@ -431,7 +431,7 @@ def apart(by, frames=60, missed=lambda i: 0):
         for when in sorted((t, t + by)):
             report(fusion, when)
         found.append(fusion.update_zoom(Frame(IMAGE, t + by), t))
-    return fusion, found, fusion.warnings(1, t)
+    return fusion, found, fusion.warnings(1, fusion.estimate(1, t))
 
 
 @pytest.mark.parametrize("by", [0.08, 0.13, 0.29, 0.49, -0.13, -0.29, -0.49])
