@@ -20,7 +20,8 @@ from cotarget.control.selection import Candidate, leaves_in
 from cotarget.control.zoom import is_seen_well, shape_of
 from cotarget.detection import Detection
 from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
-from cotarget.estimation.motion_model import GATE, HEAD_SIGMA, PAN, TILT, K, L
+from cotarget.estimation.motion_model import GATE, HEAD_SIGMA
+from cotarget.estimation.target_filter import inflated
 from cotarget.estimation.zoom_matching import CloseupFinder, Expected, Finder, MatchingSettings, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.pantilt import towards
@@ -109,8 +110,6 @@ class FusionSettings:
         unfound_s: a target that both cameras should see and that the zoom image does not show for this long is
             elsewhere [s]: the search is widened. After twice that time the target is unconfirmed. Measured times to
             find it: docs/design-notes.md.
-        inflated_size: standard deviation by which the search is widened, of the logarithm of size and depth together;
-            a nominal size twice too large is 0.7.
         just_seen_s: longest time since the last measurement for which a target still counts as seen [s].
     """
 
@@ -118,7 +117,6 @@ class FusionSettings:
     time_sigma_s: float = 2e-3
     contradicted: float = 4.0
     unfound_s: float = 1.5
-    inflated_size: float = 0.4
     just_seen_s: float = 0.2
 
 
@@ -165,18 +163,17 @@ class ZoomSearch:
     """
 
     def __init__(
-        self, make_finder: Callable[[], Finder], settings: FusionSettings, bias_sigma: float, latest_s: float
+        self, make_finder: Callable[[], Finder], settings: FusionSettings, filter: FilterSettings, latest_s: float
     ) -> None:
         """Create a search without a target.
 
         Args:
             make_finder: makes the finder for a target.
             settings: settings of the fusion.
-            bias_sigma: standard deviation of the head's bias by which the search is widened [rad].
+            filter: settings of the target filters, for the widened search.
             latest_s: largest delay of one camera's frames against the other's [s].
         """
-        self._make_finder, self._settings, self._latest_s = make_finder, settings, latest_s
-        self._bias_sigma = bias_sigma
+        self._make_finder, self._settings, self._filter, self._latest_s = make_finder, settings, filter, latest_s
         self.waiting: deque[Frame] = deque()
         self._zoom_t = math.inf
         self.apart_s = 0.0
@@ -219,7 +216,7 @@ class ZoomSearch:
         # With a wrong size or calibration the gate would never contain the target, so it is widened.
         searched = seen
         if self.is_overdue:
-            wider = _inflated(estimate, self._settings.inflated_size, self._bias_sigma)
+            wider = replace(estimate, state_covariance=inflated(estimate.state_covariance, self._filter))
             searched = wider.appearance(pose.pan, pose.tilt, pose.nominal_px) or seen
         pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
         found = self.finder.find(frame, Expected(estimate.x_fixed, searched.covariance, pan, tilt, pose.nominal_px))
@@ -293,9 +290,8 @@ class TargetFusion:
         self._unlikely: set[int] = set()  # tracks whose size or pointing contradicts the priors
         self._T_base_fixed = calibration.zoom_head.T_base_fixed
         self.states = StateHistory()
-        self.search = ZoomSearch(
-            partial(make_finder, calibration, target), settings, self._filter_settings.bias_inflation, matching.latest_s
-        )
+        make_finder = partial(make_finder, calibration, target)
+        self.search = ZoomSearch(make_finder, settings, self._filter_settings, matching.latest_s)
 
     def follow(self, number: int | None) -> None:
         """Register another track in the zoom image from now on; None for no track."""
@@ -452,11 +448,3 @@ def _contradictions(estimate: Estimate, settings: FusionSettings) -> list[str]:
     if estimate.bias_deviation > settings.contradicted:
         wrong.append(f"the head points {math.degrees(math.hypot(*estimate.bias)):.2g} degrees beside")
     return wrong
-
-
-def _inflated(estimate: Estimate, size_sigma: float, bias_sigma: float) -> Estimate:
-    """Widen the covariance of size and head bias; the ratio of size to depth, which the fixed camera sees, stays."""
-    P = estimate.state_covariance.copy()
-    P[np.ix_([L, K], [L, K])] += size_sigma**2
-    P[[PAN, TILT], [PAN, TILT]] += bias_sigma**2
-    return replace(estimate, state_covariance=P)
