@@ -170,9 +170,8 @@ def clear_stop_file(path: Path) -> str | None:
 
 LOOK_POLL_S = 0.05  # reading the stop file takes well below 1 ms; the answer is awaited in slices of this time [s]
 MOST_MISSED = 6  # slices without an answer after which the file counts as a stop; a suspended machine misses none
-RECENT_S = (
-    2 * LOOK_POLL_S
-)  # age up to which a command trusts an answer; the watchdog halts the head for a newer file [s]
+# Age up to which a command trusts an answer; the watchdog halts the head for a newer file [s].
+RECENT_S = 2 * LOOK_POLL_S
 LOOK_JOIN_S = 0.2  # time limit for the thread to end, which a hanging file may block [s]
 
 
