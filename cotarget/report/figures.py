@@ -307,7 +307,7 @@ def situation_figure(evidence: Evidence, nominal_px: tuple[float, ...], has_head
         log_ticks(ax, np.unique([float(f"{t:.2g}") for t in np.geomspace(edges[0], edges[-1], 4)]))
         ax = axes.pop(0)
         ax.hist(np.degrees(evidence.leanings), np.arange(0, 91, 7.5), color=BLUE, alpha=0.8)
-        ax.set(title="turned from facing", xlabel="[degrees]", ylabel="placements", xlim=(0, 90))
+        ax.set(title="turn from facing", xlabel="[degrees]", ylabel="placements", xlim=(0, 90))
         if has_head:
             ax = axes.pop(0)
             ax.scatter(*np.degrees(head_poses(evidence.views)).T, s=12, color=ORANGE, alpha=0.7, lw=0)
@@ -317,7 +317,7 @@ def situation_figure(evidence: Evidence, nominal_px: tuple[float, ...], has_head
             ax = axes.pop(0)
             ax.bar(range(len(nominal_px)), evidence.per_stop, color=BLUE, alpha=0.8)
             ax.set_xticks(range(len(nominal_px)), [f"{n:.0f}" for n in nominal_px], rotation=45)
-            ax.set(title="views of each zoom sample", xlabel="nominal focal length [px]", ylabel="views")
+            ax.set(title="zoom samples", xlabel="nominal focal length [px]", ylabel="views")
         return figure
 
 
