@@ -35,31 +35,20 @@ WANTED = {"tracks": 0.5, "images": 0.8}
 
 @dataclass(frozen=True)
 class EnvSpeedSettings(Settings):
-    """Settings: targets and lengths of the episodes.
-
-    Attributes:
-        targets: book, person or bird.
-        seconds: length of an episode without pictures [s].
-        seconds_seen: length of an episode with pictures [s].
-    """
+    """Settings: targets and lengths of the episodes."""
 
     seeds: Count = 1
-    targets: tuple[str, ...] = ("book", "person", "bird")
+    targets: tuple[str, ...] = ("book", "person", "bird")  # book, person or bird
+    # Length of an episode without pictures [s].
     seconds: Annotated[float, Ge(1.0), Le(SECONDS)] = 20.0  # a block and more
-    seconds_seen: Annotated[float, Gt(0), Le(SECONDS)] = 6.0
+    seconds_seen: Annotated[float, Gt(0), Le(SECONDS)] = 6.0  # length of an episode with pictures [s]
 
 
 class Alone:
     """MuJoCo alone, on a world's model with its targets' poses."""
 
     def __init__(self, world: SimWorld, model: "mujoco.MjModel", times: Sequence[float]) -> None:
-        """Prepare the poses.
-
-        Args:
-            world: the world.
-            model: model of the world.
-            times: times of its frames [s].
-        """
+        """Prepare the poses at the frames' times [s]."""
         self._model, self._data = model, mujoco.MjData(model)
         self._steps = round(1 / world.config.sim.fixed.rate_hz / model.opt.timestep)
         truth = world.truth()
@@ -83,48 +72,37 @@ def one(settings: EnvSpeedSettings, seed: int) -> list[Row]:
 def tracks(settings: EnvSpeedSettings, name: str, seed: int) -> Iterator[Row]:
     """Time blocks of steps without pictures, and of MuJoCo's steps."""
     env = Follow(name, seconds=settings.seconds)
-    actions, times = held(env, seed)
-    began = time.perf_counter()
-    env.reset(seed=seed)
-    reset_ms = 1e3 * (time.perf_counter() - began)
+    actions, times, row = prepared(env, name, "tracks", seed)
     world = env.episode.world
     alone = Alone(world, world.truth().model, times)
     for first in range(0, len(actions) - BLOCK + 1, BLOCK):
         block = range(first, first + BLOCK)
-        yield {
-            "seed": seed,
-            "target": name,
-            "what": "tracks",
-            "env_us": timed(time.thread_time, lambda i: env.step(actions[i]), block),
-            "alone_us": timed(time.thread_time, alone.step, block),
-            "reset_ms": reset_ms,
-        }
+        env_us = timed(time.thread_time, lambda i: env.step(actions[i]), block)
+        yield row | {"env_us": env_us, "alone_us": timed(time.thread_time, alone.step, block)}
     env.close()
 
 
 def images(settings: EnvSpeedSettings, name: str, seed: int) -> Iterator[Row]:
     """Time steps with pictures, and MuJoCo's with its own renderer."""
     env = Follow(name, "images", seconds=settings.seconds_seen, image_size=SIZE)
+    actions, times, row = prepared(env, name, "images", seed)
+    plain = PlainRenderer(env.episode.world, SIZE)
+    alone = Alone(env.episode.world, plain.model, times)
+    for i in range(len(actions)):
+        env_us = timed(time.perf_counter, lambda i: env.step(actions[i]), range(i, i + 1))
+        stepped_us = timed(time.perf_counter, alone.step, range(i, i + 1))
+        yield row | {"env_us": env_us, "alone_us": stepped_us + 1e6 * plain.draw(env.times[1])}
+    plain.close()
+    env.close()
+
+
+def prepared(env: Follow, name: str, what: str, seed: int) -> tuple[list[Vector], list[float], Row]:
+    """Record an episode and reset the environment; give actions, times, and what all rows share."""
     actions, times = held(env, seed)
     began = time.perf_counter()
     env.reset(seed=seed)
     reset_ms = 1e3 * (time.perf_counter() - began)
-    plain = PlainRenderer(env.episode.world, SIZE)
-    alone = Alone(env.episode.world, plain.model, times)
-    for i, action in enumerate(actions):
-        env_us = timed(time.perf_counter, lambda i: env.step(action), range(i, i + 1))  # noqa: B023  used at once
-        stepped_us = timed(time.perf_counter, alone.step, range(i, i + 1))
-        alone_us = stepped_us + 1e6 * plain.draw(env.times[1])
-        yield {
-            "seed": seed,
-            "target": name,
-            "what": "images",
-            "env_us": env_us,
-            "alone_us": alone_us,
-            "reset_ms": reset_ms,
-        }
-    plain.close()
-    env.close()
+    return actions, times, {"seed": seed, "target": name, "what": what, "reset_ms": reset_ms}
 
 
 def held(env: Follow, seed: int) -> tuple[list[Vector], list[float]]:

@@ -37,27 +37,9 @@ def _begin(jpeg: bytes) -> int:
     return start + 2 + int.from_bytes(jpeg[start + 2 : start + 4], "big")
 
 
-def _place(jpeg: bytes, rng: np.random.Generator) -> int:
-    return int(rng.integers(_begin(jpeg), len(jpeg) - SPAN - 2))
-
-
-def _twice(jpeg: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(jpeg, rng)
-    return jpeg[: at + SPAN] + jpeg[at:]
-
-
-def _missing(jpeg: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(jpeg, rng)
-    return jpeg[:at] + jpeg[at + SPAN :]
-
-
-def _zero(jpeg: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(jpeg, rng)
-    return jpeg[:at] + bytes(SPAN) + jpeg[at + SPAN :]
-
-
-def _cut(jpeg: bytes, rng: np.random.Generator) -> bytes:
-    return jpeg[: _place(jpeg, rng)] + jpeg[-2:]
+def _at_random(harm: Callable[[bytes, int], bytes]) -> Damage:
+    """Damage the data from a random place on."""
+    return lambda jpeg, rng: harm(jpeg, int(rng.integers(_begin(jpeg), len(jpeg) - SPAN - 2)))
 
 
 def _flipped(count: int) -> Damage:
@@ -72,10 +54,10 @@ def _flipped(count: int) -> Damage:
 
 DAMAGES: dict[str, Damage] = {
     "none": lambda jpeg, rng: jpeg,
-    f"{SPAN} bytes twice": _twice,
-    f"{SPAN} bytes missing": _missing,
-    f"{SPAN} bytes zero": _zero,
-    "cut short": _cut,
+    f"{SPAN} bytes twice": _at_random(lambda jpeg, at: jpeg[: at + SPAN] + jpeg[at:]),
+    f"{SPAN} bytes missing": _at_random(lambda jpeg, at: jpeg[:at] + jpeg[at + SPAN :]),
+    f"{SPAN} bytes zero": _at_random(lambda jpeg, at: jpeg[:at] + bytes(SPAN) + jpeg[at + SPAN :]),
+    "cut short": _at_random(lambda jpeg, at: jpeg[:at] + jpeg[-2:]),
     "1 byte changed": _flipped(1),
     "3 bytes changed": _flipped(3),
     "10 bytes changed": _flipped(10),

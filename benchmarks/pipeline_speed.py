@@ -63,12 +63,7 @@ class Pipeline:
     """Detection, tracking and aiming, as the loop does them for a frame."""
 
     def __init__(self, kind: str, film: Film) -> None:
-        """Start without history.
-
-        Args:
-            kind: name of the detector.
-            film: film that gives size and rate.
-        """
+        """Start a detector of a kind without history, for the film's size and rate."""
         self.target: TargetProfile = replace(DEFAULT_TARGETS["bird"], detector=kind)
         self.detector: Detector = make_detector(self.target, film.rate_hz)
         self.calibration = calibration_of(film.size)

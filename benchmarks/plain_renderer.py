@@ -15,12 +15,7 @@ class PlainRenderer:
     """mujoco.Renderer on the frames of a world without image effects."""
 
     def __init__(self, world: SimWorld, size: Size | None = None) -> None:
-        """Open the renderer.
-
-        Args:
-            world: the world.
-            size: size of the pictures, with the same field of view; by default that of the streams.
-        """
+        """Open the renderer, for pictures of a size with the same field of view; by default as large as the streams."""
         sim, self._truth = world.config.sim, world.truth()
         drawn = sim.fixed.size if size is None else size
         self._scales = {

@@ -50,19 +50,13 @@ WANTED: Mapping[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class SimSpeedSettings(FieldSettings):
-    """Settings: timed steps per world, and lengths of the runs.
-
-    Attributes:
-        seconds: length of the run without pictures [s].
-        steps: timed steps of each world.
-        seconds_rendered: length of the run with pictures [s].
-    """
+    """Settings: timed steps per world, and lengths of the runs."""
 
     seeds: Count = 1
-    steps: Count = 60
+    steps: Count = 60  # timed steps of each world
     # Timing starts after SETTLED_S, and the paths last longer by that.
-    seconds: Annotated[float, Gt(0), Le(SECONDS)] = SECONDS
-    seconds_rendered: Annotated[float, Gt(0), Le(SECONDS)] = 6.0
+    seconds: Annotated[float, Gt(0), Le(SECONDS)] = SECONDS  # length of the run without pictures [s]
+    seconds_rendered: Annotated[float, Gt(0), Le(SECONDS)] = 6.0  # length of the run with pictures [s]
 
 
 def one(settings: SimSpeedSettings, seed: int) -> list[Row]:

@@ -55,12 +55,7 @@ def main(
 ) -> int:
     """Run the command.
 
-    Args:
-        arguments: command-line arguments.
-        known: known experiments by name.
-        expected: folder of the bounds.
-        together: opens the workers of jobs that may run at the same time.
-        apart: runs the jobs that measure times.
+    ``together`` opens the workers of jobs that may run at the same time; ``apart`` runs those that measure times.
 
     Returns:
         Exit status: 1 if a seed failed, a bound is broken or a figure misses its goal (not for a quick run), else 0.
@@ -105,12 +100,9 @@ def _parser() -> argparse.ArgumentParser:
 def choose(known: Known, given: argparse.Namespace, folder: Path = OUT) -> list[Case]:
     """Make the cases of a run.
 
-    Args:
-        known: known experiments.
-        given: ``names`` of the experiments, all if empty; ``quick``, ``seeds``, ``seed_base``; and ``set``, a list of
-            NAME.KEY=VALUE with TOML values. A key that is given more than once makes a case of each value, in
-            combination with those of other keys.
-        folder: folder of all results.
+    ``given`` has the options ``names`` (all if empty), ``quick``, ``seeds``, ``seed_base`` and ``set``, a list of
+    NAME.KEY=VALUE with TOML values. A key that is given more than once makes a case of each value, in combination with
+    those of other keys.
 
     Raises:
         ConfigError: an unknown experiment or setting, or an invalid value.
@@ -234,17 +226,17 @@ def _missing(
             run = stack.enter_context(together(min(given.processes, len(others)), given.scheduler)) if others else apart
             for case in cases if given.fresh else ():  # now that there are workers
                 forget(case)
-            for job, done in itertools.chain(run(others), _closing(stack), apart(timing)):
+
+            def results() -> Iterator[tuple[Job, Done]]:
+                yield from run(others)
+                stack.close()  # the workers end before times are measured
+                yield from apart(timing)
+
+            for job, done in results():
                 if mine and done.version != mine:
                     raise ConfigError(f"a worker has cotarget {done.version}, this is {mine}; give both the same")
                 keep(job.case, job.number, done)
                 yield job, done, jobs
-
-
-def _closing(stack: contextlib.ExitStack) -> Iterator[tuple[Job, Done]]:
-    """Close the workers between the jobs that share them and those that measure times; gives no job."""
-    stack.close()
-    yield from ()
 
 
 @contextlib.contextmanager

@@ -159,21 +159,13 @@ def _load(module: str) -> Experiment:
 
 @dataclass(frozen=True)
 class Case:
-    """Experiment with given settings.
+    """Experiment with given settings."""
 
-    Attributes:
-        experiment: the experiment.
-        settings: its settings.
-        folder: folder of its results.
-        changes: changed settings, as typed.
-        quick: whether it is a quick run, which is too short for the experiment's goals.
-    """
-
-    experiment: Experiment
-    settings: Any
-    folder: Path
-    changes: tuple[str, ...] = ()
-    quick: bool = False
+    experiment: Experiment  # the experiment
+    settings: Any  # its settings
+    folder: Path  # folder of its results
+    changes: tuple[str, ...] = ()  # changed settings, as typed
+    quick: bool = False  # whether it is a quick run, which is too short for the experiment's goals
 
     @property
     def title(self) -> str:
@@ -215,11 +207,7 @@ def identity(case: Case) -> bytes:
 
 
 def missing(case: Case, mine: str = "") -> list[int]:
-    """Give the numbers that have no rows.
-
-    Args:
-        case: the case.
-        mine: version of this code, which earlier rows must have; any if empty.
+    """Give the numbers that have no rows; earlier rows must be of this version of the code, if one is given.
 
     Raises:
         ConfigError: the folder has rows of other settings or of other code.
@@ -398,9 +386,7 @@ def _on_one_thread(one: One, settings: Any, number: int) -> Done:
 def on_dask(processes: int, scheduler: str | None) -> Iterator[Run]:
     """Open a Dask cluster, and give a function that runs jobs on it; a job whose worker dies is tried once more.
 
-    Args:
-        processes: number of workers of a cluster on this machine, where no scheduler is given.
-        scheduler: address of a scheduler, such as tcp://10.0.0.1:8786.
+    The cluster has that many processes on this machine, or belongs to a scheduler, such as tcp://10.0.0.1:8786.
 
     Raises:
         ConfigError: Dask is not installed, no scheduler answers, or it lacks workers of one thread each.

@@ -15,8 +15,9 @@ import inspect
 import io
 import json
 import math
+import operator
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,19 +38,13 @@ Trail = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Bound:
-    """Figure with one of its bounds.
+    """Figure with one of its bounds."""
 
-    Attributes:
-        name: path of the figure in the summary.
-        kind: at_most, at_least or within.
-        bound: best value reached before, or a pair of limits; None before the first.
-        reached: value of this run; None where it was not measured.
-    """
-
-    name: str
-    kind: str
-    bound: float | tuple[float, float] | None
-    reached: float | None
+    name: str  # path of the figure in the summary
+    kind: str  # at_most, at_least or within
+    bound: float | tuple[float, float] | None  # best value reached before, or a pair of limits; None before the first
+    reached: float | None  # value of this run; None where it was not measured
+    trail: Trail = ()  # where the bound is in its file
 
     def __str__(self) -> str:
         limits = self.bound if isinstance(self.bound, tuple) else (math.nan if self.bound is None else self.bound,)
@@ -81,59 +76,39 @@ def compare(name: str, figures: Mapping[str, Any], folder: Path = EXPECTED) -> l
     Raises:
         ConfigError: the file cannot be read.
     """
-    return [bound for bound, _ in _beside(name, figures, folder)[0]]
-
-
-def _beside(
-    name: str, figures: Mapping[str, Any], folder: Path
-) -> tuple[list[tuple[Bound, Callable[[float], None]]], dict[str, Any]]:
-    """Pair each bounded figure with a function that replaces its bound in the table; also give the table."""
     path = folder / f"{name}.json"
-    try:
-        tree = json.loads(path.read_bytes()) if path.exists() else {}
-    except ValueError as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
     reached_by = dict(leaves(plain(figures)))
-    found: list[tuple[Bound, Callable[[float], None]]] = []
-    for trail, limit in leaves(tree):
+    found: list[Bound] = []
+    for trail, limit in leaves(_bounds_in(path)):
         kind, of = (trail[-1], trail[:-1]) if trail and trail[-1] in KINDS else (KINDS[0], trail)
         pair = kind == "within" and isinstance(limit, list) and len(limit) == 2
         if not all(isinstance(each, int | float) for each in (limit if pair else () if limit is None else (limit,))):
             raise ConfigError(f"{path}: {' / '.join(trail)}: {limit!r} is no bound")
         reached = reached_by.get(of)
         value = float(reached) if isinstance(reached, int | float) and not isinstance(reached, bool) else None
-        bound = Bound(" / ".join(of), kind, tuple(limit) if pair else limit, value)
-        found.append((bound, functools.partial(_put, tree, trail)))
-    return found, tree
+        found.append(Bound(" / ".join(of), kind, tuple(limit) if pair else limit, value, trail))
+    return found
 
 
-def _put(tree: dict[str, Any], trail: Trail, value: float) -> None:
-    for key in trail[:-1]:
-        tree = tree[key]
-    tree[trail[-1]] = value
+def _bounds_in(path: Path) -> dict[str, Any]:
+    try:
+        tree: dict[str, Any] = json.loads(path.read_bytes()) if path.exists() else {}
+    except ValueError as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    return tree
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Figures of a case that was run in full or in part.
+    """Figures of a case that was run in full or in part."""
 
-    Attributes:
-        case: the case.
-        seeds: the last run of each seed, by number.
-        summary: its figures; None where there are none.
-        text: its figures as text, or why there are none.
-        missed: figures that miss their goal; None where the experiment has no goals.
-        bounds: figures with their bounds; only for the quick settings.
-        broken: whether there are no figures or no plot.
-    """
-
-    case: Case
-    seeds: Mapping[int, Row]
-    summary: Mapping[str, Any] | None = None
-    text: str = "no seed has given any rows"
-    missed: Sequence[str] | None = None
-    bounds: Sequence[Bound] = ()
-    broken: bool = True
+    case: Case  # the case
+    seeds: Mapping[int, Row]  # the last run of each seed, by number
+    summary: Mapping[str, Any] | None = None  # its figures; None where there are none
+    text: str = "no seed has given any rows"  # its figures as text, or why there are none
+    missed: Sequence[str] | None = None  # figures that miss their goal; None where the experiment has no goals
+    bounds: Sequence[Bound] = ()  # figures with their bounds; only for the quick settings
+    broken: bool = True  # whether there are no figures or no plot
 
     @property
     def failed(self) -> dict[int, str]:
@@ -211,23 +186,20 @@ def tighten(outcomes: Sequence[Outcome], folder: Path = EXPECTED) -> Iterator[st
         experiment = outcome.case.experiment
         if outcome.summary is None or outcome.failed or experiment.alone:
             continue
-        found, tree = _beside(experiment.name, experiment.bounded(outcome.summary), folder)
-        changed = [(bound, put) for bound, put in found if bound.tighter is not None]
-        for bound, put in changed:
-            put(bound.tighter or 0.0)
+        path = folder / f"{experiment.name}.json"
+        bounds, tree = compare(experiment.name, experiment.bounded(outcome.summary), folder), _bounds_in(path)
+        better = [bound for bound in bounds if bound.tighter is not None]
+        for bound in better:
+            functools.reduce(operator.getitem, bound.trail[:-1], tree)[bound.trail[-1]] = bound.tighter
             yield f"{experiment.name}: {bound} -> {bound.tighter:g}"
-        if changed:
-            write_atomically(folder / f"{experiment.name}.json", (json.dumps(tree, indent=2) + "\n").encode())
+        if better:
+            write_atomically(path, (json.dumps(tree, indent=2) + "\n").encode())
 
 
 def write_report(folder: Path, outcomes: Sequence[Outcome], skipped: Mapping[str, str], command: str) -> Path:
     """Write report.html, which needs no other file; give its path.
 
-    Args:
-        folder: folder of all results.
-        outcomes: results of the cases.
-        skipped: reasons by experiment for those that were not run.
-        command: command that repeats the run.
+    ``skipped`` has the reasons of the experiments that were not run; ``command`` repeats the run.
 
     Raises:
         ConfigError: the page cannot be written.

@@ -147,14 +147,7 @@ def columns(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
 
 
 def points(ax: "Axes", at: float, values: Iterable[float | None], **how: Any) -> None:
-    """Draw the values that are there: their median with a bar from least to largest, and each value beside it.
-
-    Args:
-        ax: axes to draw in.
-        at: place on the x axis.
-        values: values to draw.
-        how: colour and label, as for matplotlib.
-    """
+    """Draw the values that are there: their median with a bar from least to largest, and each value beside it."""
     told = [value for value in values if value is not None]
     if told:
         found = spread(told)
@@ -164,15 +157,7 @@ def points(ax: "Axes", at: float, values: Iterable[float | None], **how: Any) ->
 
 
 def bars(ax: "Axes", at: Sequence[float], values: Sequence[Sequence[float]], width: float, **how: Any) -> None:
-    """Draw the mean of each group of values as a bar with its standard error, and each value as a point on it.
-
-    Args:
-        ax: axes to draw in.
-        at: place of each group on the x axis.
-        values: values of each group.
-        width: width of a bar.
-        how: colour and label, as for matplotlib.
-    """
+    """Draw the mean of each group of values as a bar with its standard error, and each value as a point on it."""
     means, errors = np.array([mean_of(each) for each in values]).T
     ax.bar(at, means, width, yerr=np.nan_to_num(errors), capsize=3, **how)
     for place, each in zip(at, values, strict=True):

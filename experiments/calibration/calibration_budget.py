@@ -34,20 +34,13 @@ WANTED = {"exponent_noise": (0.75, 1.25), "exponent_placements": (-1.6, -0.3), "
 
 @dataclass(frozen=True)
 class BudgetSettings(Settings):
-    """Settings: what is varied, and what is constant.
-
-    Attributes:
-        noises_px: noise of corners [px].
-        placements: numbers of board placements.
-        looks: head poses per placement.
-        targets: number of targets on which the error is measured.
-    """
+    """Settings: what is varied, and what is constant."""
 
     seeds: Count = 5
-    noises_px: tuple[Positive, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
-    placements: tuple[Boards, ...] = (6, 12, 24, 48)
-    looks: Looks = 4
-    targets: Count = 100
+    noises_px: tuple[Positive, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)  # noise of corners [px]
+    placements: tuple[Boards, ...] = (6, 12, 24, 48)  # numbers of board placements
+    looks: Looks = 4  # head poses per placement
+    targets: Count = 100  # number of targets on which the error is measured
 
 
 def one(settings: BudgetSettings, seed: int) -> list[Row]:

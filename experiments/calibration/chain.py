@@ -78,14 +78,9 @@ def _row(settings: ChainSettings, seed: int, case: str) -> Row:
 
 
 def bound(calibration: Calibration, noise_px: float, blocks: tuple[Block, ...], pixels: Array, depths: Array) -> Array:
-    """Compute the Cramer-Rao bound of the pointing error towards targets [rad], (n,).
+    """Compute the Cramer-Rao bound of the pointing error towards pixels (n, 2) at depths (n,) [m], (n,) [rad].
 
-    Args:
-        calibration: calibration from views with this corner noise and no other.
-        noise_px: standard deviation of the corners' coordinates.
-        blocks: unknown parameters.
-        pixels: targets in the fixed view, (n, 2).
-        depths: depths of the targets [m], (n,).
+    The calibration is from views with this noise of the corners and no other; the blocks' parameters are unknown.
     """
     assert calibration.board is not None
     points = board_points(calibration.board)

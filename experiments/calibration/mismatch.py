@@ -70,19 +70,12 @@ def bent(sagitta: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Rig and changes in one case.
+    """Rig and changes in one case."""
 
-    Attributes:
-        truth: the rig.
-        shape: true corners of the board [m], (N, 3).
-        change: change of the views.
-        after: the rig from the middle of the session on.
-    """
-
-    truth: Truth = RIG
-    shape: Array | None = None
-    change: Change = as_they_are
-    after: Truth | None = None
+    truth: Truth = RIG  # the rig
+    shape: Array | None = None  # true corners of the board [m], (N, 3)
+    change: Change = as_they_are  # change of the views
+    after: Truth | None = None  # the rig from the middle of the session on
 
 
 def _fixed(*distortion: float, fisheye: bool = False) -> Case:
@@ -179,18 +172,18 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     for case, mine in grouped(rows, "case").items():
         told = [row for row in mine if not row["refused"]]
 
-        def of(key: str, told: Sequence[Row] = told) -> Array:
-            return np.array([row[key] for row in told], dtype=float)
+        def of(key: str, reduce: Callable[[Any], Any] = rms, told: Sequence[Row] = told) -> float:
+            return float(reduce([row[key] for row in told])) if told else float("nan")
 
         found[case] = {
-            "measured_px": rms(of("measured_px")),
-            "predicted_px": rms(of("predicted_px")),
-            "ratio": float(np.median(of("ratio"))) if told else float("nan"),
-            "ratio_worst": float(of("ratio").max()) if told else float("nan"),
-            "held_out_measured_px": rms(of("held_out_measured_px")),
-            "held_out_predicted_px": rms(of("held_out_predicted_px")),
-            "widened": float(np.median(of("widened"))) if told else float("nan"),
-            "jitter_deg": float(np.median(of("jitter_deg"))) if told else float("nan"),
+            "measured_px": of("measured_px"),
+            "predicted_px": of("predicted_px"),
+            "ratio": of("ratio", np.median),
+            "ratio_worst": of("ratio", max),
+            "held_out_measured_px": of("held_out_measured_px"),
+            "held_out_predicted_px": of("held_out_predicted_px"),
+            "widened": of("widened", np.median),
+            "jitter_deg": of("jitter_deg", np.median),
             "refused": len(mine) - len(told),
             "good": float(np.mean([bool(row["refused"]) or row["ratio"] <= WITHIN for row in mine])),
             "why_refused": sorted({row["refused"] for row in mine if row["refused"]}),

@@ -39,6 +39,7 @@ NOISE_PX = (0.1, 0.2)
 SERVED = 1 / 3  # least fraction of the fixed view that the zoom camera reaches
 WITHIN = 2.0  # largest ratio to the predicted error
 CHANCE_DRAWS, CHANCE_TARGETS = 50, 50
+FIGURES = ("widened", "measured_px", "predicted_px", "ratio", "beyond_by_chance", "gamma_off_m", "gamma_off_deg")
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,7 @@ def one(settings: RigsSettings, seed: int) -> list[Row]:
     truth = rig.truth
     noise_px = float(rng.uniform(*NOISE_PX))
     board = BoardConfig(square=0.1 * rig.grown)
-    near, far = BOARD_DEPTHS
-    placing = Placing(boards=settings.boards, looks=settings.looks, depths=(near * rig.grown, far * rig.grown))
+    placing = Placing(boards=settings.boards, looks=settings.looks, depths=_grown(BOARD_DEPTHS, rig.grown))
     views = spread_views(truth, board_points(board), rng, noise_px, placing)
     paired = {view.board for view in views if view.camera == "zoom" and view.pan == view.tilt == 0}
     row = {
@@ -81,19 +81,12 @@ def one(settings: RigsSettings, seed: int) -> list[Row]:
         "noise_px": noise_px,
         "pairs_at_home": len(paired),
         "refused": "",
-        "widened": None,
-        "measured_px": None,
-        "predicted_px": None,
-        "ratio": None,
-        "beyond_by_chance": None,
-        "gamma_off_m": None,
-        "gamma_off_deg": None,
-    }
+    } | dict.fromkeys(FIGURES)
     try:
         calibration = calibrate_views(views, board, SIZES)
     except CalibrationError as error:
         return [row | {"refused": str(error)}]
-    pixels, depths = draw_targets(rng, settings.targets, _target_depths(rig.grown))
+    pixels, depths = draw_targets(rng, settings.targets, _grown(TARGET_DEPTHS, rig.grown))
     reached = reaches(truth, pixels, depths)
     off = misses(calibration, truth, pixels[reached], depths[reached])
     expected = predicted_pointing(calibration, pixels[reached], depths[reached])
@@ -158,9 +151,9 @@ def draw_rig(rng: np.random.Generator) -> Drawn:
             eps=float(np.radians(rng.uniform(-0.2, 0.2))),
         )
         grown = max(1.0, baseline / GROWS_FROM)
-        pixels, depths = draw_targets(np.random.default_rng(0), 100, _target_depths(grown))
-        near, far = BOARD_DEPTHS
-        depths_of_boards = np.exp(np.linspace(np.log(near * grown), np.log(far * grown), len(pixels)))
+        pixels, depths = draw_targets(np.random.default_rng(0), 100, _grown(TARGET_DEPTHS, grown))
+        near, far = np.log(_grown(BOARD_DEPTHS, grown))
+        depths_of_boards = np.exp(np.linspace(near, far, len(pixels)))
         served = float(min(reaches(truth, pixels, d).mean() for d in (depths, depths_of_boards)))
         if served >= SERVED:
             return Drawn(truth, grown, served, redrawn)
@@ -175,8 +168,8 @@ def reaches(truth: Truth, pixels: Array, depths: Array) -> Array:
         return np.asarray(((q >= limits[:, 0]) & (q <= limits[:, 1])).all(axis=1))
 
 
-def _target_depths(grown: float) -> tuple[float, float]:
-    return TARGET_DEPTHS[0] * grown, TARGET_DEPTHS[1] * grown
+def _grown(depths: tuple[float, float], grown: float) -> tuple[float, float]:
+    return depths[0] * grown, depths[1] * grown
 
 
 def any_direction(rng: np.random.Generator) -> Array:

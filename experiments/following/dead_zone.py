@@ -27,16 +27,11 @@ WANTED = {"commands_per_min": (0.0, 0.5), "reversals_per_min": (0.0, 0.5), "tpo_
 
 @dataclass(frozen=True)
 class DeadZoneSettings(FieldSettings):
-    """Settings: targets of the runs.
-
-    Attributes:
-        targets: book or person.
-        closed_loop: whether the zoom view corrects the aim.
-    """
+    """Settings: targets of the runs."""
 
     seeds: Count = 2
-    targets: tuple[str, ...] = ("book", "person")
-    closed_loop: bool = True
+    targets: tuple[str, ...] = ("book", "person")  # book or person
+    closed_loop: bool = True  # whether the zoom view corrects the aim
 
 
 def one(settings: DeadZoneSettings, seed: int) -> list[Row]:

@@ -42,24 +42,15 @@ NEAREST_M = 2.0
 
 @dataclass(frozen=True)
 class DepthSettings(Settings):
-    """Settings: rigs, targets and errors.
-
-    Attributes:
-        baselines: baselines of the rigs of each seed [m].
-        depths: depths of the targets [m].
-        targets: number of targets at each depth.
-        wrong: relative excess of the known size.
-        scatter: relative standard deviation of true sizes.
-        noise_px: noise of the measured size [px].
-    """
+    """Settings: rigs, targets and errors."""
 
     seeds: Count = 20
-    baselines: tuple[Positive, ...] = (0.1, 0.4, 1.5, 3.0)
-    depths: tuple[Annotated[float, Ge(NEAREST_M)], ...] = (5.0, 10.0, 20.0, 50.0, 100.0)
-    targets: Count = 100
-    wrong: Annotated[float, Gt(-1)] = 0.1
-    scatter: Positive = 0.1
-    noise_px: Positive = 0.5
+    baselines: tuple[Positive, ...] = (0.1, 0.4, 1.5, 3.0)  # baselines of the rigs of each seed [m]
+    depths: tuple[Annotated[float, Ge(NEAREST_M)], ...] = (5.0, 10.0, 20.0, 50.0, 100.0)  # depths of the targets [m]
+    targets: Count = 100  # number of targets at each depth
+    wrong: Annotated[float, Gt(-1)] = 0.1  # relative excess of the known size
+    scatter: Positive = 0.1  # relative standard deviation of true sizes
+    noise_px: Positive = 0.5  # noise of the measured size [px]
 
 
 def one(settings: DepthSettings, seed: int) -> list[Row]:
@@ -106,13 +97,7 @@ def _of_rig(settings: DepthSettings, seed: int, number: int) -> list[Row]:
 
 
 def turned_by(calibration: Calibration, truth: Truth, x_fixed: Array) -> Array:
-    """Compute the rotation of the line of sight per relative error of the depth, to first order, (n,) [rad].
-
-    Args:
-        calibration: exact calibration of the rig.
-        truth: the rig.
-        x_fixed: targets in the fixed frame, (n, 3) [m].
-    """
+    """Compute the rotation of the line of sight per relative error of the depth, to first order, (n,) [rad]."""
     q = aim(calibration, x_fixed)
     looking = truth.zoom_fixed(q[:, 0], q[:, 1])
     x_zoom = truth.in_zoom(x_fixed, q[:, 0], q[:, 1])
@@ -123,15 +108,9 @@ def turned_by(calibration: Calibration, truth: Truth, x_fixed: Array) -> Array:
 def measured_depths(
     calibration: Calibration, truth: Truth, pixels: Array, x_fixed: Array, sizes: Array, noise_px: Array
 ) -> Array:
-    """Compute depths from apparent widths, (n,) [m].
+    """Compute depths from the apparent widths of bars as wide as the targets, (n,) [m].
 
-    Args:
-        calibration: calibration that gives the depth.
-        truth: true rig, whose lens projects bars as wide as the targets.
-        pixels: centres of the targets, (n, 2) [px].
-        x_fixed: positions of the centres, (n, 3) [m].
-        sizes: true sizes, (n,) [m].
-        noise_px: noise of the measured sizes, (n,) [px].
+    Centres are at pixels (n, 2) and x_fixed (n, 3) [m]; sizes (n,) are true ones [m].
     """
     half = np.c_[sizes / 2, np.zeros((len(sizes), 2))]
     wide = truth.fixed.project(x_fixed + half)[:, 0] - truth.fixed.project(x_fixed - half)[:, 0] + noise_px

@@ -48,46 +48,28 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class DetectorsSettings(Settings):
-    """Settings: scenes, detectors and camera shake.
-
-    Attributes:
-        seconds: length of each run [s].
-        kinds: kinds of target, person or bird; each is run with five targets and with none.
-        detectors: detectors to compare.
-        shake_px: standard deviation of the image's shift along each axis [px].
-    """
+    """Settings: scenes, detectors and camera shake."""
 
     seeds: Count = 2
-    seconds: Annotated[float, Gt(COME_S), Le(SECONDS)] = SECONDS
-    kinds: tuple[str, ...] = GROUPED
-    detectors: tuple[DetectorName, ...] = DETECTORS
-    shake_px: NotNegative = 1.0
+    seconds: Annotated[float, Gt(COME_S), Le(SECONDS)] = SECONDS  # length of each run [s]
+    kinds: tuple[str, ...] = GROUPED  # kinds of target, person or bird; each is run with five targets and with none
+    detectors: tuple[DetectorName, ...] = DETECTORS  # detectors to compare
+    shake_px: NotNegative = 1.0  # standard deviation of the image's shift along each axis [px]
 
 
 @dataclass
 class Watch:
-    """Detector and tracker behind one camera, with the results of each frame.
+    """Detector and tracker behind one camera, with the results of each frame."""
 
-    Attributes:
-        kind: kind of target that is searched.
-        name: name of the detector.
-        camera: STANDS or SHAKES.
-        target: configuration of the target.
-        config: configuration of the rig.
-        detector: searches the frames; by default one of that name.
-        on: pairs of track and target that match, per frame.
-        off: time [s] and tracks on no target, per frame.
-        found: for each wholly visible target in each frame, whether a track was on it.
-    """
-
-    kind: str
-    name: str
-    camera: str
-    target: TargetProfile
-    config: RigConfig
-    detector: Detector | None = None
-    on: list[list[tuple[int, str]]] = field(default_factory=list)
-    off: list[tuple[float, list[int]]] = field(default_factory=list)
+    kind: str  # kind of target that is searched
+    name: str  # name of the detector
+    camera: str  # STANDS or SHAKES
+    target: TargetProfile  # configuration of the target
+    config: RigConfig  # configuration of the rig
+    detector: Detector | None = None  # searches the frames; by default one of that name
+    on: list[list[tuple[int, str]]] = field(default_factory=list)  # pairs of track and target that match, per frame
+    off: list[tuple[float, list[int]]] = field(default_factory=list)  # time [s] and tracks on no target, per frame
+    # For each wholly visible target in each frame, whether a track was on it.
     found: list[bool] = field(default_factory=list)
 
     def __post_init__(self) -> None:

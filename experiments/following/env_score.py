@@ -26,14 +26,10 @@ Policy = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class ScoreSettings(Settings):
-    """Settings: length of an episode.
-
-    Attributes:
-        seconds: length of an episode [s].
-    """
+    """Settings: length of an episode."""
 
     seeds: Count = 5
-    seconds: Annotated[float, Gt(0), Le(SECONDS)] = SECONDS
+    seconds: Annotated[float, Gt(0), Le(SECONDS)] = SECONDS  # length of an episode [s]
 
 
 def one(settings: ScoreSettings, seed: int) -> list[Row]:

@@ -32,15 +32,11 @@ from experiments.paper.paper_loop import Follow
 
 @dataclass(frozen=True)
 class FieldSettings(Settings):
-    """Settings of runs in the field: their length, and whether the rig is calibrated.
+    """Settings of runs in the field: their length, and whether the rig is calibrated."""
 
-    Attributes:
-        seconds: length of each run, from the start of the clock to the end of the targets' paths [s].
-        calibrated: whether the rig is calibrated from rendered boards; otherwise it is known exactly.
-    """
-
+    # Length of each run, from the start of the clock to the end of the targets' paths [s].
     seconds: Annotated[float, Gt(BACKGROUND_S), Le(SECONDS)] = SECONDS
-    calibrated: bool = True
+    calibrated: bool = True  # whether the rig is calibrated from rendered boards; otherwise it is known exactly
 
 
 @dataclass(frozen=True)
@@ -67,16 +63,7 @@ def held(
     settings: FollowSettings | None = None,
     view: WideView | None = None,
 ) -> list[Judged]:
-    """Follow a target of a simulated rig, and judge every frame.
-
-    Args:
-        calibration: calibration that the pipeline uses.
-        config: configuration of the rig and its world.
-        name: name of the target.
-        seconds: length of the run [s].
-        settings: settings of the pipeline; the defaults for this rig if None.
-        view: recorded view of the fixed camera; rendered if None.
-    """
+    """Follow a target of a simulated rig, and judge every frame; a view that is not recorded is rendered."""
     target, rows = target_of(config, name), list[Judged]()
     for step, truth in watched(calibration, config, target, seconds, settings, view):
         add_row(rows, step, truth, name, target)
@@ -92,10 +79,7 @@ def watched(
     view: WideView | None = None,
     selector: TargetSelector | None = None,
 ) -> Iterator[tuple[Step, Truth]]:
-    """Follow a target of a simulated rig; yield each Step with the ground truth.
-
-    Arguments as for `held`; by default the selector takes the first target that comes.
-    """
+    """Follow a target of a simulated rig, by default the first that comes; yield each Step with the ground truth."""
     settings = settings or FollowSettings()
     if view is None:
         world, detector = SimWorld(config), make_detector(target, config.sim.fixed.rate_hz)

@@ -19,12 +19,7 @@ SCENE = "outdoor"
 
 
 def hold_config(name: str, seed: int, scene: str = SCENE) -> RigConfig:
-    """Configure one target to follow for 20 s.
-
-    Args:
-        name: book, person or bird.
-        seed: seed of everything random.
-        scene: name of the scene; outdoor scenes have clutter.
+    """Configure one target, a book, person or bird, to follow for 20 s.
 
     Raises:
         ConfigError: an unknown target.
@@ -35,11 +30,6 @@ def hold_config(name: str, seed: int, scene: str = SCENE) -> RigConfig:
 def five_targets_config(seed: int, kind: str = "person", scene: str = SCENE) -> RigConfig:
     """Configure five persons or birds that cross the fixed view (`cotarget.sim.targets.random_paths.group_paths`).
 
-    Args:
-        seed: seed of everything random.
-        kind: person or bird.
-        scene: name of the scene; outdoor scenes have clutter.
-
     Raises:
         ConfigError: an unknown kind.
     """
@@ -47,13 +37,7 @@ def five_targets_config(seed: int, kind: str = "person", scene: str = SCENE) -> 
 
 
 def field_config(paths: Mapping[str, tuple[Waypoint, ...]], seed: int, scene: str = SCENE) -> RigConfig:
-    """Configure the default rig under the field's conditions.
-
-    Args:
-        paths: paths of the targets by name; without any there is no target.
-        seed: seed of everything random.
-        scene: name of the scene; outdoor scenes have clutter.
-    """
+    """Configure the default rig under the field's conditions, with targets on paths; outdoor scenes have clutter."""
     sim = SimConfig()
     sim = replace(
         sim,

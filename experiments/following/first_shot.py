@@ -61,16 +61,12 @@ ROUNDING = 1e-6  # tolerance of frame times, in seconds and in periods
 
 @dataclass(frozen=True)
 class FirstShotSettings(FieldSettings):
-    """Settings: targets, with a shot every 0.8 s from the third second on.
-
-    Attributes:
-        targets: book, person or bird.
-    """
+    """Settings: targets, with a shot every 0.8 s from the third second on."""
 
     seeds: Count = 2
     # The first shot uses the fixed camera's frame of BEGIN_S, which arrives LATENCY_S later.
     seconds: Annotated[float, Gt(BEGIN_S + LATENCY_S), Le(SECONDS)] = SECONDS
-    targets: tuple[str, ...] = ("book", "person", "bird")
+    targets: tuple[str, ...] = ("book", "person", "bird")  # book, person or bird
 
 
 def one(settings: FirstShotSettings, seed: int) -> list[Row]:
@@ -85,29 +81,17 @@ def one(settings: FirstShotSettings, seed: int) -> list[Row]:
 
 @dataclass(frozen=True)
 class Shot:
-    """One command, and what it was computed from.
+    """One command, and what it was computed from."""
 
-    Attributes:
-        seen_t: time of the fixed camera's frame [s].
-        exposed_t: time of the zoom frame that it was computed for [s].
-        pixel: estimated target position in the fixed camera's frame [px], (2,).
-        depth: estimated depth of the target in that frame [m].
-        moved: predicted motion from ``seen_t`` to ``exposed_t``, in the fixed frame [m], (3,).
-        wanted_px: solved nominal focal length [px].
-        pan: commanded pan, rounded to steps [rad].
-        tilt: commanded tilt, rounded to steps [rad].
-        nominal_px: nominal focal length of the lens's position [px].
-    """
-
-    seen_t: float
-    exposed_t: float
-    pixel: Array
-    depth: float
-    moved: Array
-    wanted_px: float
-    pan: float
-    tilt: float
-    nominal_px: float
+    seen_t: float  # time of the fixed camera's frame [s]
+    exposed_t: float  # time of the zoom frame that it was computed for [s]
+    pixel: Array  # estimated target position in the fixed camera's frame [px], (2,)
+    depth: float  # estimated depth of the target in that frame [m]
+    moved: Array  # predicted motion from ``seen_t`` to ``exposed_t``, in the fixed frame [m], (3,)
+    wanted_px: float  # solved nominal focal length [px]
+    pan: float  # commanded pan, rounded to steps [rad]
+    tilt: float  # commanded tilt, rounded to steps [rad]
+    nominal_px: float  # nominal focal length of the lens's position [px]
 
 
 def fire(

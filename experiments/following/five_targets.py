@@ -35,16 +35,11 @@ WANTED = 1.5  # goal: targets served by the best policy over those by first-come
 
 @dataclass(frozen=True)
 class FiveSettings(FieldSettings):
-    """Settings: kinds of targets.
-
-    Attributes:
-        kinds: person or bird.
-        closed_loop: whether the zoom view corrects the aim.
-    """
+    """Settings: kinds of targets."""
 
     seeds: Count = 2
-    kinds: tuple[str, ...] = ("person", "bird")
-    closed_loop: bool = False
+    kinds: tuple[str, ...] = ("person", "bird")  # person or bird
+    closed_loop: bool = False  # whether the zoom view corrects the aim
 
 
 def one(settings: FiveSettings, seed: int) -> list[Row]:

@@ -62,14 +62,10 @@ ALSO = ("tpe_px_median", "false_tracks_per_min", "commands_per_min", "reversals_
 
 @dataclass(frozen=True)
 class HoldSettings(FieldSettings):
-    """Settings: targets of the runs.
-
-    Attributes:
-        targets: book, person or bird.
-    """
+    """Settings: targets of the runs."""
 
     seeds: Count = 2
-    targets: tuple[str, ...] = tuple(WANTED)
+    targets: tuple[str, ...] = tuple(WANTED)  # book, person or bird
 
 
 def one(settings: HoldSettings, seed: int) -> list[Row]:

@@ -11,6 +11,7 @@ than a real one.
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,19 +22,116 @@ from cotarget.control.head import HeadController
 from cotarget.control.zoom import ExpectedTarget, ZoomController
 from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
+from cotarget.estimation.motion_model import filter_settings
 from cotarget.geometry import Array
 from cotarget.pantilt import base_head, nearest, solve
 from cotarget.rig import Angles, Frame, Rig
 from cotarget.sim.truth import Truth
-from cotarget.tracking.track import tracking_settings
+from cotarget.tracking.track import AxisFilter, tracking_settings
 from cotarget.tracking.tracker import Tracker
-from experiments.following.lone_course import SEARCH_S, Course, Sighting
 
 COAST_S = 0.6  # longest prediction of a target out of sight [s]
 SIZE_SIGMA = 0.1  # relative standard deviation of a size, for the zoom controller
 FIRST_INTERVAL_S = 0.04  # frame interval before the second frame [s]
 OVERLAP = 0.1  # overlap of neighbouring views of a scan
 RING = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))  # search pattern in half views
+SEARCH_S = 3.0  # longest search around the prediction [s]
+SIZES_S = 0.5  # window of the size estimate, a wing beat or a step [s]
+# Duration of a manoeuvre as white acceleration [s], by the target's motion model. The choice is in docs/design-notes.md
+# (Experiments). It is the setting lasts_s of `experiments.following.single_ptz`. A book that is carried accelerates
+# more than its motion model says.
+LASTS_S = {"standing": 2.0, "walking": 0.25, "flying": 0.1}
+CLIPPED = 9.0  # factor on the variance of a centre that the image's border cuts
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Detection as directions."""
+
+    t: float  # time [s]
+    pan: float  # pan that centres it [rad]
+    tilt: float  # tilt that centres it [rad]
+    sides: tuple[float, float]  # width and height over the focal length
+    clipped: bool  # whether the image's border cuts it
+
+
+class Course:
+    """Target's pan and tilt, each filtered with constant velocity."""
+
+    def __init__(self, target: TargetProfile, noise_px: float, lasts_s: float | None = None) -> None:
+        """Start without a sighting.
+
+        Detections' centres have this noise. A manoeuvre lasts ``lasts_s`` as white acceleration, by default as long as
+        the target's motion model says.
+        """
+        self._target, self._noise_px = target, noise_px
+        self._lasts_s = LASTS_S[target.motion] if lasts_s is None else lasts_s
+        self._settings = filter_settings(target)
+        self._axes: list[AxisFilter] = []
+        self._sizes: list[Sighting] = []
+        self.seen_t = -math.inf
+        self.whole = False  # whether the last sighting was not clipped
+
+    @property
+    def known(self) -> bool:
+        """Whether the target was ever sighted."""
+        return bool(self._axes)
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        """Width and height as tangents: the largest of the window for wings, else the median."""
+        sides = np.array([each.sides for each in self._sizes])
+        w, h = sides.max(axis=0) if self._target.largest_over_time else np.median(sides, axis=0)
+        return float(w), float(h)
+
+    @property
+    def size(self) -> float:
+        """The dimension with a known size, as a tangent."""
+        w, h = self.sides
+        return h if self._target.is_vertical(w, h) else w
+
+    @property
+    def range(self) -> float:
+        """Distance from the known size [m]."""
+        return self._target.size / self.size
+
+    def saw(self, seen: Sighting, focal_px: float) -> None:
+        """Update with a sighting; one after a long gap restarts the filter."""
+        self.whole = not seen.clipped
+        if self.whole:
+            past = [each for each in self._sizes if each.t >= seen.t - SIZES_S and not each.clipped]
+            self._sizes = [*past, seen]
+        else:  # the visible part is a lower limit of the size
+            w, h = seen.sides if not self._sizes else map(max, zip(seen.sides, self.sides, strict=True))
+            self._sizes = [replace(seen, sides=(w, h))]
+        motion, distance = self._settings.motion, self.range
+        by_size = self._settings.noise_of_size * max(seen.sides)
+        variance = (self._noise_px / focal_px) ** 2 + by_size**2 * (CLIPPED if seen.clipped else 1.0)
+        places = (seen.pan, seen.tilt)
+        if not self.known or seen.t - self.seen_t > SEARCH_S:
+            self._axes = [AxisFilter(place, variance, (motion.speed / distance) ** 2) for place in places]
+        else:
+            for axis, place in zip(self._axes, places, strict=True):
+                axis.predict(seen.t - self.seen_t, self._noise(distance))
+                axis.correct(place, variance)
+        self.seen_t = seen.t
+
+    def at(self, t: float) -> tuple[Angles, Angles]:
+        """Predict pan and tilt at a time, with their variances."""
+        dt = t - self.seen_t
+        spread = [axis.covariance.predicted(dt, self._noise(self.range)).position for axis in self._axes]
+        (pan, tilt) = (axis.position + dt * axis.velocity for axis in self._axes)
+        return (pan, tilt), (spread[0], spread[1])
+
+    @property
+    def rates(self) -> Angles:
+        """Rates of pan and tilt [rad/s]."""
+        pan, tilt = self._axes
+        return pan.velocity, tilt.velocity
+
+    def _noise(self, distance: float) -> float:
+        """Give the white acceleration of an angle [rad^2/s^3] that stands for manoeuvres at constant velocity."""
+        return self._lasts_s * (self._settings.motion.acceleration / distance) ** 2
 
 
 class LoneCamera:
@@ -55,18 +153,10 @@ class LoneCamera:
         field: Sequence[Angles],
         lasts_s: float | None = None,
     ) -> None:
-        """Start a scan at the pose that is nearest to the current one.
+        """Start a scan of the field's poses (see `scan_of`) at the one that is nearest to the current pose.
 
-        Args:
-            rig: the rig, whose fixed camera is not used.
-            truth: ground truth, which gives head and lens at a frame's time.
-            calibration: calibration of zoom camera, T and head.
-            target: configuration of the target.
-            detector: detector for the zoom camera's frames.
-            delay_s: time from a command to motion [s].
-            noise_px: standard deviation of a detection's centre [px].
-            field: poses of the scan [rad]; see `scan_of`.
-            lasts_s: see `Course`.
+        The rig's fixed camera is not used; ground truth gives head and lens at a frame's time. A command takes
+        ``delay_s`` until motion. For ``noise_px`` and ``lasts_s`` see `Course`.
         """
         self._rig, self._truth, self._calibration, self._target = rig, truth, calibration, target
         self._detector, self._delay_s, self._field = detector, delay_s, list(field)
@@ -219,12 +309,7 @@ class LoneCamera:
 
 
 def scan_of(rig: Rig, calibration: Calibration) -> list[Angles]:
-    """Give poses whose overlapping views at the shortest focal length cover the fixed camera's field, row by row [rad].
-
-    Args:
-        rig: the rig, for its limits.
-        calibration: calibration, for the fixed camera's direction and field of view.
-    """
+    """Give poses [rad] whose overlapping views at the shortest focal length cover the fixed camera's field, by rows."""
     width, height = rig.zoom.size
     fx, fy = calibration.zoom_head.lens.stops[0].focal_px
     views = (1 - OVERLAP) * 2 * math.atan(width / 2 / fx), (1 - OVERLAP) * 2 * math.atan(height / 2 / fy)

@@ -15,9 +15,10 @@ models.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cotarget.board import board_points
@@ -30,49 +31,77 @@ from experiments.calibration.synthetic.rig import SIZE, SIZES
 from experiments.calibration.synthetic.views import Boards, Looks, Placing, spread_views
 from experiments.engine import Count, Row, Settings
 from experiments.following.mounted import MOUNTED_DEG, at, cell_name, mounted, off_px, wanted_focal_px
-from experiments.following.regimes import FACTOR, ratios, reach, regime
 from experiments.following.simpler import CENTRING, FULL, IGNORED, MODELS, TABLE, TURNED, ZEROED, models_of
 from experiments.tables import as_text, grouped, quartiles, rms
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 BOARD = BoardConfig()
 STEP = np.radians(SimHead().step_deg)
 CONDITIONS = ("exact", "seen")
 OPPONENTS = (IGNORED, ZEROED[IGNORED])
 SHOWN = ((10.0, 0.4), (20.0, 1.5), (50.0, 0.4))  # depth and baseline [m] in the printed table
+FACTOR = 5.0  # factor by which the full model has to be better than "offset ignored" somewhere
 
 
 @dataclass(frozen=True)
 class ModelsSettings(Settings):
-    """Settings: rigs, calibration and targets.
-
-    Attributes:
-        baselines: baselines of the rigs of each seed [m].
-        depths: depths of the targets [m].
-        targets: number of targets at each depth.
-        mounted_deg: standard deviation of each mounting angle that should be zero [degrees].
-        boards: placements of the calibration board.
-        looks: head poses per placement.
-        corner_px: noise of corners [px].
-        pixel_px: noise of the target's pixel [px].
-        depth_error: relative error of the target's depth.
-        zero_depth: depth of the target on which pan and tilt are set [m].
-    """
+    """Settings: rigs, calibration and targets."""
 
     seeds: Count = 10
-    baselines: tuple[Positive, ...] = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)
-    depths: tuple[Positive, ...] = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
-    targets: Count = 60
-    mounted_deg: Positive = MOUNTED_DEG
-    boards: Boards = 12
-    looks: Looks = 4
-    corner_px: Positive = 0.2
-    pixel_px: Positive = 0.5
-    depth_error: Positive = 0.05
-    zero_depth: Positive = CENTRING.zero_depth
+    baselines: tuple[Positive, ...] = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)  # baselines of the rigs of each seed [m]
+    depths: tuple[Positive, ...] = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)  # depths of the targets [m]
+    targets: Count = 60  # number of targets at each depth
+    mounted_deg: Positive = MOUNTED_DEG  # standard deviation of each mounting angle that should be zero [degrees]
+    boards: Boards = 12  # placements of the calibration board
+    looks: Looks = 4  # head poses per placement
+    corner_px: Positive = 0.2  # noise of corners [px]
+    pixel_px: Positive = 0.5  # noise of the target's pixel [px]
+    depth_error: Positive = 0.05  # relative error of the target's depth
+    zero_depth: Positive = CENTRING.zero_depth  # depth of the target on which pan and tilt are set [m]
+
+
+def reach(depth: float, baseline: float, zero_depth: float = math.inf) -> float:
+    """Compute a target's distance in baselines, as far as an ignored offset is concerned.
+
+    The baseline subtends an angle of 1 / this [rad] at the target, or that angle less the one at the target of the
+    zeros.
+    """
+    angle = baseline * abs(1 / depth - 1 / zero_depth)
+    return 1 / angle if angle else math.inf
+
+
+def ratios(rows: Sequence[Row], condition: str, model: str = IGNORED) -> dict[float, Array]:
+    """Give the ratio of a model's rms error to the full model's, by `reach`.
+
+    Returns:
+        For each reach in rising order, the ratio of each seed; of several depths and baselines with the same reach, the
+        one with the least median.
+    """
+    errors = {(r["depth_m"], r["baseline_m"], r["seed"]): r[f"{condition}_deg"] for r in rows if r["model"] == FULL}
+    cells: dict[tuple[float, float, float], list[float]] = {}
+    for row in rows:
+        if row["model"] == model:
+            cell = row["depth_m"], row["baseline_m"]
+            cells.setdefault((row["reach"], *cell), []).append(row[f"{condition}_deg"] / errors[*cell, row["seed"]])
+    found: dict[float, Array] = {}
+    for (far, *_), values in sorted(cells.items()):
+        same = next((known for known in found if math.isclose(known, far)), far)
+        found[same] = min(found.get(same, np.array(values)), np.array(values), key=np.median)
+    return found
+
+
+def regime(rows: Sequence[Row], condition: str, model: str = IGNORED) -> tuple[float, float]:
+    """Give the range of `reach` in which the full model's error is FACTOR times smaller than another's.
+
+    Returns:
+        The smallest reach measured, and the largest up to which the median over the seeds holds for all cells; both nan
+        where it does not hold at the smallest.
+    """
+    within: list[float] = []
+    for far, values in ratios(rows, condition, model).items():
+        if np.median(values) < FACTOR:
+            break
+        within.append(far)
+    return (within[0], within[-1]) if within else (math.nan, math.nan)
 
 
 def one(settings: ModelsSettings, seed: int) -> list[Row]:
@@ -195,13 +224,13 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     axes[1, 2].set_xlabel("1 / (baseline |1 / depth - 1 / depth of the zero|)")
 
 
-def _over_depth(ax: "Axes", rows: Sequence[Row], key: str, number: int, **style: Any) -> None:
+def _over_depth(ax: Axes, rows: Sequence[Row], key: str, number: int, **style: Any) -> None:
     """Plot one model's medians and quartiles over the seeds, shifted and thinner by its number."""
     aside = [row | {"depth_m": row["depth_m"] * 1.03 ** (number - 3)} for row in rows]
     quartiles(ax, aside, "depth_m", key, ls="-" if number % 2 == 0 else "--", lw=3 - number / 3, **style)
 
 
-def _regimes(ax: "Axes", rows: Sequence[Row], model: str) -> None:
+def _regimes(ax: Axes, rows: Sequence[Row], model: str) -> None:
     """Plot the ratio of a model's error to the full model's, quartiles over the seeds, and the regime of FACTOR."""
     for condition, colour in zip(CONDITIONS, ("C0", "C1"), strict=True):
         by_reach = {far: values for far, values in ratios(rows, condition, model).items() if math.isfinite(far)}

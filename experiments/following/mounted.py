@@ -29,13 +29,7 @@ def cell_name(depth: float, baseline: float) -> str:
 
 
 def mounted(rng: np.random.Generator, baseline: float, mounted_deg: float = MOUNTED_DEG) -> Truth:
-    """Draw a rig as people mount it.
-
-    Args:
-        rng: source of all random values.
-        baseline: distance between the cameras' optical centres with the head at home [m].
-        mounted_deg: standard deviation of each angle that should be zero [degrees].
-    """
+    """Draw a rig as people mount it, with a baseline [m] and a standard deviation of each angle that should be zero."""
     while abs((direction := any_direction(rng))[2]) > OUT_OF_PLANE:
         pass
     turns = Rotation.from_rotvec(np.radians(rng.normal(0, mounted_deg, (2, 3))))

@@ -25,15 +25,10 @@ from experiments.engine import SHARED, Settings
 
 @dataclass(frozen=True)
 class RigText:
-    """Content and path of a rig.toml when it was read; it is not read again.
+    """Content and path of a rig.toml when it was read; it is not read again."""
 
-    Attributes:
-        text: content of the file; empty for the default rig.
-        path: absolute path of the file, for relative paths in it; empty for the default rig.
-    """
-
-    text: str = ""
-    path: str = ""
+    text: str = ""  # content of the file; empty for the default rig
+    path: str = ""  # absolute path of the file, for relative paths in it; empty for the default rig
 
     def config(self, scene: str, targets: tuple[str, ...], seed: int) -> RigConfig:
         """Configure the rig in a scene with targets."""
@@ -66,16 +61,12 @@ def _calibrate(rig: RigText, seed: int) -> Calibration:
 class OwnRig(Settings):
     """Settings with an optional rig of the user's own.
 
-    Attributes:
-        rig: path of a rig.toml of a simulated rig; empty for the default rig.
-        rig_toml: content of that file, so that results of another file are not reused; set by the class.
-
     Raises:
         ConfigError: the file cannot be read, is invalid, has changed, or is not of a simulated rig.
     """
 
-    rig: str = ""
-    rig_toml: str = ""
+    rig: str = ""  # path of a rig.toml of a simulated rig; empty for the default rig
+    rig_toml: str = ""  # content of that file, so that results of another file are not reused; set by the class
 
     def __post_init__(self) -> None:
         said = ""

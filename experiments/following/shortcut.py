@@ -15,10 +15,11 @@ home.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from annotated_types import Ge
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from cotarget.config import DEFAULT_TARGETS
@@ -32,10 +33,6 @@ from experiments.engine import Count, Row, Settings
 from experiments.following.mounted import at, exact_calibration, idealised, mounted, off_px, wanted_focal_px
 from experiments.paper.worked_example import X_FIXED_MM, X_ZOOM0_MM, stand_in
 from experiments.tables import grouped, rms
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 BOOK = DEFAULT_TARGETS["book"]
 ANYWHERE = (-np.pi, np.pi)  # limits of both axes; the head's own limits are not studied here
@@ -51,22 +48,15 @@ ROUNDING_DEG = 1e-6  # arctan2 does not resolve smaller angles
 
 @dataclass(frozen=True)
 class ShortcutSettings(Settings):
-    """Settings: rigs and positions of the targets.
-
-    Attributes:
-        baseline: baseline of the mounted rigs [m].
-        depths: depths of the targets [m].
-        grid: columns and rows of target pixels in the fixed image, from edge to edge.
-        near: number of additional targets near the zoom camera's axis.
-        rigs: kinds of rig, from RIGS.
-    """
+    """Settings: rigs and positions of the targets."""
 
     seeds: Count = 20
-    baseline: Positive = 0.4
-    depths: tuple[Positive, ...] = (5.0, 10.0, 20.0, 50.0)
+    baseline: Positive = 0.4  # baseline of the mounted rigs [m]
+    depths: tuple[Positive, ...] = (5.0, 10.0, 20.0, 50.0)  # depths of the targets [m]
+    # Columns and rows of target pixels in the fixed image, from edge to edge.
     grid: tuple[Annotated[int, Ge(2)], Annotated[int, Ge(2)]] = (13, 9)
-    near: Count = 60
-    rigs: tuple[Literal["mounted", "Section 4.2"], ...] = ("mounted", "Section 4.2")
+    near: Count = 60  # number of additional targets near the zoom camera's axis
+    rigs: tuple[Literal["mounted", "Section 4.2"], ...] = ("mounted", "Section 4.2")  # kinds of rig, from RIGS
 
 
 def one(settings: ShortcutSettings, seed: int) -> list[Row]:
@@ -228,23 +218,15 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     _by_region(regions.subplots(), summarise(rows))
 
 
-def _by_region(ax: "Axes", summary: Mapping[str, Any]) -> None:
+def _by_region(ax: Axes, summary: Mapping[str, Any]) -> None:
     """Plot the error in each region over all depths, with quartiles over the seeds."""
     for i, (rig, found) in enumerate(summary.items()):
         for j, method in enumerate(READINGS):
             figures = [found[method][name]["all"] for name in REGIONS]
             low, mid, high = (np.array([each[key] for each in figures]) for key in ("deg_low", "deg", "deg_high"))
             x = np.arange(len(REGIONS)) + 0.1 * (2 * i + j - 1.5)
-            ax.errorbar(
-                x,
-                mid,
-                [mid - low, high - mid],
-                fmt="os"[i],
-                mfc=f"C{j}" if i == 0 else "w",
-                color=f"C{j}",
-                capsize=2,
-                label=f"{NAMES[method]}; rig: {rig}",
-            )
+            style: dict[str, Any] = {"fmt": "os"[i], "mfc": f"C{j}" if i == 0 else "w", "color": f"C{j}", "capsize": 2}
+            ax.errorbar(x, mid, [mid - low, high - mid], label=f"{NAMES[method]}; rig: {rig}", **style)
     ax.set_xticks(range(len(REGIONS)), [name.replace(" ", "\n", 1) for name in REGIONS])
     ax.set(yscale="log", ylabel="rms pointing error, all depths [degrees]")
     ax.legend(frameon=False, fontsize="small")

@@ -43,48 +43,30 @@ MODELS = (FULL, *TURNED, TABLE, *ZEROED.values())
 
 @dataclass(frozen=True)
 class Crude:
-    """Standard deviation of measurements by tape measure and protractor, along or about each axis.
+    """Standard deviation of measurements by tape measure and protractor, along or about each axis."""
 
-    Attributes:
-        between: offset between the cameras [m].
-        lever: position of the camera on the head [m].
-        turn: rotation of either [rad].
-    """
-
-    between: float = 0.02
-    lever: float = 0.01
-    turn: float = np.radians(1.0)
+    between: float = 0.02  # offset between the cameras [m]
+    lever: float = 0.01  # position of the camera on the head [m]
+    turn: float = np.radians(1.0)  # rotation of either [rad]
 
 
 @dataclass(frozen=True)
 class Centring:
-    """How the look-up table is learnt and the zeros are set.
+    """How the look-up table is learnt and the zeros are set."""
 
-    Attributes:
-        grid: columns and rows of pixels, from edge to edge of the fixed image.
-        depth: depth of the table's targets [m].
-        zero_depth: depth of the target for the zeros [m].
-        scatter: standard deviation of each axis when a person or a servo centres a target, about one step of the head
-            [rad].
-    """
-
-    grid: tuple[int, int] = (9, 7)
-    depth: float = 10.0
-    zero_depth: float = 50.0
+    grid: tuple[int, int] = (9, 7)  # columns and rows of pixels, from edge to edge of the fixed image
+    depth: float = 10.0  # depth of the table's targets [m]
+    zero_depth: float = 50.0  # depth of the target for the zeros [m]
+    # Standard deviation of each axis when a person or a servo centres a target, about one step of the head [rad].
     scatter: float = np.radians(0.05)
 
 
 @dataclass(frozen=True)
 class Models:
-    """All models of a rig.
+    """All models of a rig."""
 
-    Attributes:
-        models: models by name.
-        zeros: offsets of pan and tilt of the zeroed models, (2,) [rad].
-    """
-
-    models: Mapping[str, Model]
-    zeros: Mapping[str, Array]
+    models: Mapping[str, Model]  # models by name
+    zeros: Mapping[str, Array]  # offsets of pan and tilt of the zeroed models, (2,) [rad]
 
     def poses(self, pixels: Array, depths: Array) -> dict[str, Array]:
         """Give pan and tilt by each of MODELS for pixels (n, 2) and depths (n,) [m], (n, 2) [rad]."""
@@ -105,12 +87,8 @@ def models_of(
 ) -> Models:
     """Make every model of a rig.
 
-    Args:
-        truth: the rig, on which the table is learnt and crude measurements are made.
-        calibration: calibration of the rig: the full model, and the source of what the others know.
-        rng: source of the scatter.
-        crude: scatter of crude measurements.
-        centring: how the table is learnt and the zeros are set.
+    The table is learnt and crude measurements are made on the rig itself. The calibration is the full model, and the
+    source of what the others know.
     """
     beside = -calibration.zoom_head.T_base_fixed.inv().translation  # position of the head, seen from the fixed camera
     still = RigidTransform.identity()

@@ -39,20 +39,15 @@ FIGURES = ("closeup_yield", "in_frame_ratio", "in_frame_of_all", "tpo_width_medi
 
 @dataclass(frozen=True)
 class SingleSettings(Settings):
-    """Settings: runs and detection losses.
-
-    Attributes:
-        seconds: length of each run [s].
-        targets: book, person or bird.
-        misses: fractions of zoom frames in which the target is missed while the image moves.
-        lasts_s: duration of the single camera's manoeuvres [s] (see `experiments.following.lone_course`); by default
-            that of each target.
-    """
+    """Settings: runs and detection losses."""
 
     seeds: Count = 6
-    seconds: Annotated[float, Gt(BACKGROUND_S), Le(SECONDS)] = SECONDS
-    targets: tuple[str, ...] = LONE
+    seconds: Annotated[float, Gt(BACKGROUND_S), Le(SECONDS)] = SECONDS  # length of each run [s]
+    targets: tuple[str, ...] = LONE  # book, person or bird
+    # Fractions of zoom frames in which the target is missed while the image moves.
     misses: tuple[Annotated[float, Interval(ge=0, le=1)], ...] = (0.05, 0.5, 0.9)
+    # Duration of the single camera's manoeuvres [s] (see `experiments.following.lone_camera`); by default that of each
+    # target.
     lasts_s: Positive | None = None
 
 

@@ -2,28 +2,61 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetProfile
-from cotarget.evaluation import TruthDetector, TruthFinder, closeup_of, true_calibration
+from cotarget.detection import Detection
+from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, closeup_of, counted, true_calibration
 from cotarget.metrics import BACKGROUND_S, ROUNDING_S, WHOLLY_VISIBLE
 from cotarget.metrics import Row as Judged
 from cotarget.pantilt import towards
 from cotarget.pipeline import FollowSettings, follow
-from cotarget.rig import Rig
+from cotarget.rig import Frame, Image, Rig
 from cotarget.safety.safe_rig import guard
-from cotarget.sim.truth import Outlines
+from cotarget.sim.truth import Outlines, Truth
 from cotarget.sim.world import SimWorld
 from experiments.following.field_scenes import hold_config
 from experiments.following.lone_camera import LoneCamera, scan_of
-from experiments.following.shaken import NOISE, Shaken
 
 WAYS = PAIR, LONE_CAMERA = "pair", "lone"
 FAR = 1000.0  # distance at which the offset of the cameras is negligible [m]
 STREAM = 25  # random stream
+NOISE = TruthNoise()
+APART = 1 << 32  # offset of the seed from the detectors' own
+MOVED_PX, MOVED_S = 1.0, 0.02  # least shift of a moving image, within this time before and after its exposure
+
+
+class Shaken:
+    """Detector with true positions and noise, and more misses while the image moves."""
+
+    mask: Image | None = None
+
+    def __init__(self, outlines: Outlines, truth: Truth, seed: int, miss: float) -> None:
+        """Prepare the detectors at rest and in motion, where a fraction ``miss`` of the frames has no detection."""
+        self._still = TruthDetector(outlines, seed, NOISE, camera="zoom")
+        self._moving = TruthDetector(outlines, seed, replace(NOISE, miss=miss), camera="zoom")
+        self._truth, self._miss, self._numbers_at = truth, miss, counted(seed + APART)
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """Detect the target."""
+        return (self._moving if self.moves(frame.t) else self._still).detect(frame)
+
+    def misses(self, t: float) -> bool:
+        """Decide whether the target is missed at a time [s], for another detector."""
+        return self._numbers_at(t).random() < (self._miss if self.moves(t) else NOISE.miss)
+
+    def moves(self, t: float) -> bool:
+        """Check whether head or lens move the image at a time [s]."""
+        width = self._truth.lens("zoom", t).size[0]
+        before, after = max(t - MOVED_S, 0.0), t + MOVED_S
+        focal_px = self._truth.lens("zoom", t).focal_px[0]
+        turned = np.subtract(self._truth.head_at(after), self._truth.head_at(before))
+        grown = abs(self._truth.nominal_at(after) / self._truth.nominal_at(before) - 1)
+        return bool(focal_px * np.abs(turned).max() > MOVED_PX or width / 2 * grown > MOVED_PX)
 
 
 def config_of(name: str, seed: int) -> RigConfig:
@@ -37,15 +70,9 @@ def config_of(name: str, seed: int) -> RigConfig:
 
 
 def held(way: str, name: str, seed: int, seconds: float, miss: float, lasts_s: float | None = None) -> list[Judged]:
-    """Run one way from a start without search; judge each zoom frame.
+    """Run one way, PAIR or LONE_CAMERA, from a start without search; judge each zoom frame.
 
-    Args:
-        way: PAIR or LONE_CAMERA.
-        name: name of the target.
-        seed: seed of everything random.
-        seconds: length of the run [s].
-        miss: fraction of zoom frames in which the target is missed while the image moves.
-        lasts_s: duration of the single camera's manoeuvres; see `Course`.
+    While the image moves, the target is missed in a fraction ``miss`` of the zoom frames. For ``lasts_s`` see `Course`.
     """
     world = SimWorld(config_of(name, seed), rendered=())
     target, calibration = world.config.target(name), true_calibration(world)
@@ -110,35 +137,24 @@ def by_pair(
 
 def judge(outlines: Outlines, name: str, target: TargetProfile, t: float) -> Judged:
     """Make the row of a zoom frame from ground truth; fields of commands and tracks are placeholders."""
-    closeup = closeup_of(outlines, name, target, t)
-    wide = outlines.silhouette(name, "fixed", t)
-    lens = outlines.lens("zoom", t)
+    closeup, wide = closeup_of(outlines, name, target, t), outlines.silhouette(name, "fixed", t)
+    not_known: dict[str, Any] = dict.fromkeys(
+        ("u_wide_px", "v_wide_px", "u_detected_px", "v_detected_px", "range_m", "depth_m"), math.nan
+    )
+    nothing: dict[str, Any] = dict.fromkeys(
+        ("pan_commanded_deg", "tilt_commanded_deg", "focal_commanded_px", "pan_deg", "tilt_deg"), 0.0
+    )
     return Judged(
         t_s=t,
         t_fixed_s=t,
         state="",
         track=-1,
-        u_px=closeup.u_px,
-        v_px=closeup.v_px,
-        width_px=closeup.width_px,
-        height_px=closeup.height_px,
-        size_px=closeup.size_px,
-        wanted_px=closeup.wanted_px,
-        visible=closeup.visible,
+        **asdict(closeup),
         in_wide=wide is not None and wide.visible >= WHOLLY_VISIBLE,
-        u_wide_px=math.nan,
-        v_wide_px=math.nan,
-        u_detected_px=math.nan,
-        v_detected_px=math.nan,
         decoded=False,
         decoded_wide=False,
         off_target="",
-        range_m=math.nan,
-        depth_m=math.nan,
-        pan_commanded_deg=0.0,
-        tilt_commanded_deg=0.0,
-        focal_commanded_px=0.0,
-        pan_deg=0.0,
-        tilt_deg=0.0,
-        focal_px=lens.focal_px[0],
+        focal_px=outlines.lens("zoom", t).focal_px[0],
+        **not_known,
+        **nothing,
     )

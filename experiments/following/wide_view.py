@@ -67,30 +67,19 @@ class Kept:
 
 @dataclass(frozen=True)
 class Seen:
-    """One frame.
+    """One frame."""
 
-    Attributes:
-        detections: detections in the frame.
-        picture: its image; None where nothing was rendered.
-        mask: the detector's foreground mask; None where there is none.
-    """
-
-    detections: tuple[Detection, ...]
-    picture: Kept | None = None
-    mask: Kept | None = None
+    detections: tuple[Detection, ...]  # detections in the frame
+    picture: Kept | None = None  # its image; None where nothing was rendered
+    mask: Kept | None = None  # the detector's foreground mask; None where there is none
 
 
 @dataclass(frozen=True)
 class WideView:
-    """Frames of one run by time.
+    """Frames of one run by time."""
 
-    Attributes:
-        frames: frames by microseconds.
-        pictures: whether the images are stored.
-    """
-
-    frames: Mapping[int, Seen] = field(repr=False)
-    pictures: bool
+    frames: Mapping[int, Seen] = field(repr=False)  # frames by microseconds
+    pictures: bool  # whether the images are stored
 
     def at(self, t: float) -> Seen:
         """Give the frame of a time [s]."""
@@ -98,13 +87,7 @@ class WideView:
 
 
 def record(config: RigConfig, target: TargetProfile, seconds: float) -> WideView:
-    """Read the fixed camera alone, and run the detector on each frame.
-
-    Args:
-        config: configuration of the rig and its world.
-        target: configuration of the target.
-        seconds: length of the run [s].
-    """
+    """Read the fixed camera alone for some seconds, and run the target's detector on each frame."""
     frames: dict[int, Seen] = {}
     detector, shelf = make_detector(target, config.sim.fixed.rate_hz), Shelf()
     with SimWorld(config, rendered=WIDE).rig as rig:
@@ -119,10 +102,7 @@ def record(config: RigConfig, target: TargetProfile, seconds: float) -> WideView
 def open_on(view: WideView, config: RigConfig, *, closed_loop: bool) -> tuple[SimWorld, "RecordedDetector"]:
     """Open a world with the recorded frames, and the detector that gives the recorded detections.
 
-    Args:
-        view: recording of the same world, with any latencies.
-        config: configuration of the rig and its world.
-        closed_loop: whether the zoom camera is rendered.
+    The recording is of the same world, with any latencies. The zoom camera is rendered in closed loop only.
     """
     assert view.pictures or not closed_loop, "the zoom view is searched for what the wide view shows"
     world = SimWorld(config, rendered=CLOSE if closed_loop else ())

@@ -47,16 +47,12 @@ WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
 
 @dataclass(frozen=True)
 class BookSettings(OwnRigInField):
-    """Settings: time for head and lens, and places.
-
-    Attributes:
-        seconds: time from centred to close-up; the book leaves its first place when it is moved [s].
-        places: number of places of the book, one or two.
-    """
+    """Settings: time for head and lens, and places."""
 
     seeds: Count = 2
+    # Time from centred to close-up; the book leaves its first place when it is moved [s].
     seconds: Annotated[float, Ge(LEAST_S), Le(BOOK_MOVED_AT[0] - TURN_S)] = 2.0
-    places: Annotated[int, Ge(1), Le(len(ARRIVES_S))] = 2
+    places: Annotated[int, Ge(1), Le(len(ARRIVES_S))] = 2  # number of places of the book, one or two
 
 
 def one(settings: BookSettings, seed: int) -> Pictured:

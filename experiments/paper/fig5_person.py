@@ -53,16 +53,12 @@ WANTED: Mapping[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class PersonSettings(OwnRigInField):
-    """Settings: length of the runs, and detector.
-
-    Attributes:
-        seconds: length of a run; the person's path does not end (`cotarget.sim.targets.paths`) [s].
-        detector: detector of this project's pipeline, mog2 or motion.
-    """
+    """Settings: length of the runs, and detector."""
 
     seeds: Count = 2
+    # Length of a run; the person's path does not end (`cotarget.sim.targets.paths`) [s].
     seconds: Annotated[float, Gt(FIRST_S)] = 7.0
-    detector: DetectorName = "mog2"
+    detector: DetectorName = "mog2"  # detector of this project's pipeline, mog2 or motion
 
 
 def one(settings: PersonSettings, seed: int) -> Pictured:

@@ -28,17 +28,11 @@ QUALITY = 85
 
 @dataclass(frozen=True)
 class Shown:
-    """Picture of the documentation.
+    """Picture of the documentation."""
 
-    Attributes:
-        experiment: name of the experiment that makes it.
-        picture: name of its file among the results, without suffix.
-        name: name of its file in docs/pictures, without suffix.
-    """
-
-    experiment: str
-    picture: str
-    name: str
+    experiment: str  # name of the experiment that makes it
+    picture: str  # name of its file among the results, without suffix
+    name: str  # name of its file in docs/pictures, without suffix
 
 
 SHOWN = (
@@ -71,15 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def gather(results: Path, out: Path, names: Collection[str]) -> list[Path]:
-    """Write all pictures of some experiments that the documentation shows; on an error, none.
-
-    Args:
-        results: results folder of `python -m experiments`.
-        out: folder for the pictures.
-        names: names of the experiments.
-
-    Returns:
-        The files that were written.
+    """Write all pictures of some experiments that the documentation shows, and name the files; on an error, none.
 
     Raises:
         ConfigError: a picture is missing, cannot be read or cannot be written.

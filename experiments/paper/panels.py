@@ -14,11 +14,7 @@ Panel = tuple[Image, str]
 
 
 def laid_out(rows: Iterable[Sequence[Panel]]) -> bytes:
-    """Arrange rows of panels, all of one aspect ratio and equally many per row, as one PNG.
-
-    Args:
-        rows: images, BGR or grey, with their captions.
-    """
+    """Arrange rows of captioned panels, all of one aspect ratio and equally many per row, as one PNG."""
     return cv2.imencode(".png", np.vstack([np.hstack([_panel(*each) for each in row]) for row in rows]))[1].tobytes()
 
 

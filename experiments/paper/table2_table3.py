@@ -46,14 +46,10 @@ CAMERA_WORDS = {"zoom": "zoom camera", "fixed": "fixed camera"}
 
 @dataclass(frozen=True)
 class Settings(OwnRig):
-    """Settings: size of the capture session.
-
-    Attributes:
-        placements: number of board placements.
-    """
+    """Settings: size of the capture session."""
 
     seeds: Count = 3
-    placements: Count = 30
+    placements: Count = 30  # number of board placements
 
 
 def one(settings: Settings, seed: int) -> list[Row]:

@@ -12,7 +12,7 @@ compared with the paper's claims.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +20,6 @@ from cotarget.camera import Intrinsics, focal_for_size
 from cotarget.geometry import Array, RigidTransform, Rotation, angle_between
 from cotarget.pantilt import base_head, shortcut, solve
 from experiments.engine import Row, Settings
-
-if TYPE_CHECKING:
-    pass
-
 
 # Table 2 as (u, v); the paper lists [v, u].
 FIXED = Intrinsics((640, 480), (686.0, 684.0), (325.0, 239.0))
@@ -114,30 +110,14 @@ def _exactly() -> list[Line]:
     nearly = float(np.linalg.norm(x_zoom0))
     found = solve(T.apply(x_zoom0), T)
     pan, tilt, reach = (float(each[0]) for each in (found.pan, found.tilt, found.range))
-    nan = math.nan
+    nan, asked_for = math.nan, "what the exact method asks for"
     lines: list[Line] = [
         ("exact", "range = |x_zoom0|", "mm", 10464.0, 1.0, nearly, "the depth after centring; 10510 where cut"),
-        (
-            "exact",
-            "f at 10510 mm",
-            "px",
-            7155.0,
-            1.0,
-            focal_for_size(BOOK_MM, WANTED_PX, 10510.0),
-            "what the exact method asks for",
-        ),
+        ("exact", "f at 10510 mm", "px", 7155.0, 1.0, focal_for_size(BOOK_MM, WANTED_PX, 10510.0), asked_for),
         ("stand-in T", "pan", "deg", nan, 0.01, math.degrees(pan), "exact"),
         ("stand-in T", "tilt", "deg", nan, 0.01, math.degrees(tilt), "exact; down is negative"),
         ("stand-in T", "range", "mm", 10464.0, 1.0, reach, "exact; the turned camera has moved too"),
-        (
-            "stand-in T",
-            "f",
-            "px",
-            7155.0,
-            1.0,
-            focal_for_size(BOOK_MM, WANTED_PX, reach),
-            "what the exact method asks for",
-        ),
+        ("stand-in T", "f", "px", 7155.0, 1.0, focal_for_size(BOOK_MM, WANTED_PX, reach), asked_for),
     ]
     gamma = RigidTransform.from_translation(x_zoom0 - np.array(X_FIXED_MM))  # used for the depth in x_fixed only
     for words, reading in (("Table 1", "table"), ("Section 4.2", "example")):

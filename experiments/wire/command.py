@@ -8,14 +8,15 @@ import bisect
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from cotarget.backends import open_rig
 from cotarget.config import RigConfig
-from cotarget.detection import Detection, Detector, make_detector
+from cotarget.detection import Detection, make_detector
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.emulators.process import EmulatedRig
 from cotarget.pipeline import follow
-from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, Speed
+from cotarget.rig import Clock, Frame, Rig, Speed
 from cotarget.safety.safe_rig import guard
 from experiments.engine import Row
 from experiments.wire.rig import Tap, exact_calibration, load, tapped
@@ -44,65 +45,43 @@ class Notes:
     turns: list[Turn] = field(default_factory=list)
 
 
-class TimedCamera:
+class Noted:
+    """Device or detector with calls that are noted; all else is its own."""
+
+    def __init__(self, device: Any, notes: Notes) -> None:
+        self._device, self._notes = device, notes
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._device, name)
+
+
+class TimedCamera(Noted):
     """Camera that records when a frame arrived and when it was returned."""
-
-    def __init__(self, camera: Camera, notes: Notes) -> None:
-        self._camera, self._notes = camera, notes
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) [px]."""
-        return self._camera.size
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
         """Read a frame from the camera."""
-        frame = self._camera.read(newer_than, timeout)
+        frame: Frame = self._device.read(newer_than, timeout)
         self._notes.turns.append(Turn(frame.t + self._notes.latency_s, self._notes.clock.now()))
         return frame
 
 
-class TimedHead:
+class TimedHead(Noted):
     """Head that records when a move is commanded."""
-
-    def __init__(self, head: PanTilt, notes: Notes) -> None:
-        self._head, self._notes = head, notes
-
-    @property
-    def limits(self) -> PanTiltLimits:
-        """Limits of the head."""
-        return self._head.limits
-
-    def state(self) -> PanTiltState:
-        """Give the head's state."""
-        return self._head.state()
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """Command the head."""
         self._notes.turns[-1].called = self._notes.clock.now()
-        return self._head.move(pan, tilt, speed, wait)
-
-    def halt(self) -> None:
-        """Halt the head."""
-        self._head.halt()
+        return self._device.move(pan, tilt, speed, wait)
 
 
-class TimedDetector:
+class TimedDetector(Noted):
     """Detector that records when a frame is searched."""
-
-    def __init__(self, detector: Detector, notes: Notes) -> None:
-        self._detector, self._notes = detector, notes
-
-    @property
-    def mask(self) -> Image | None:
-        """Foreground mask of the detector."""
-        return self._detector.mask
 
     def detect(self, frame: Frame) -> list[Detection]:
         """Run the detector."""
         turn, clock = self._notes.turns[-1], self._notes.clock
         turn.detecting = clock.now()
-        found = self._detector.detect(frame)
+        found: list[Detection] = self._device.detect(frame)
         turn.detected = clock.now()
         return found
 
@@ -123,8 +102,9 @@ def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
     with guard(open_tapped(config, taps), config.safety) as rig:
         notes = Notes(rig.clock, rig.spec.fixed.latency_s)
         target = config.target(name)
-        detector = TimedDetector(make_detector(target, rig.spec.fixed.rate_hz), notes)
-        timed = replace(rig, fixed=TimedCamera(rig.fixed, notes), head=TimedHead(rig.head, notes))
+        detector: Any = TimedDetector(make_detector(target, rig.spec.fixed.rate_hz), notes)
+        devices: dict[str, Any] = {"fixed": TimedCamera(rig.fixed, notes), "head": TimedHead(rig.head, notes)}
+        timed = replace(rig, **devices)
         for _ in follow(timed, exact_calibration(emulated.sim), target, detector, seconds=seconds):
             pass
     return [row | {"load": load()} for row in parts_of(notes.turns, taps[0])]

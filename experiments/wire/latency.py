@@ -11,6 +11,7 @@ import math
 import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -77,7 +78,7 @@ class NotedCamera:
         self._camera = camera
         self.times: set[float] = set()
 
-    def __getattr__(self, name: str) -> object:
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._camera, name)
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:

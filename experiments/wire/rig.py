@@ -29,19 +29,13 @@ def exact_calibration(config: RigConfig) -> Calibration:
 
 @dataclass
 class Tap:
-    """Serial port that records its traffic.
+    """Serial port that records its traffic."""
 
-    Attributes:
-        port: real port.
-        clock: clock of the rig.
-        written: each piece that was sent, with the time of its first byte [s].
-        received: number of bytes received.
-    """
-
-    port: Any
-    clock: Any
+    port: Any  # real port
+    clock: Any  # clock of the rig
+    # Each piece that was sent, with the time of its first byte [s].
     written: list[tuple[float, bytes]] = field(default_factory=list)
-    received: int = 0
+    received: int = 0  # number of bytes received
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.port, name)
@@ -75,9 +69,7 @@ def tapped(clock: Any) -> Iterator[list[Tap]]:
 def beside(serve: Callable[..., None], *arguments: Any) -> Iterator[Any]:
     """Run a server in another process inside the block; yield its first message.
 
-    Args:
-        serve: function that gets a pipe and the arguments, sends its address, and ends when it receives something.
-        arguments: arguments that can be pickled.
+    The server gets a pipe and the arguments, sends its address, and ends when it receives something.
 
     Raises:
         DeviceError: the process ended without a message.

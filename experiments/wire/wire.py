@@ -10,53 +10,58 @@
 All run in real time beside the emulator, which needs its own core. On a busy machine the figures include its load.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
 
 from cotarget.errors import ConfigError, choices
 from cotarget.schema import Positive
 from experiments.engine import Count, Row, Settings
 from experiments.report import compare
+from experiments.tables import grouped
 from experiments.wire import age, command, latency, parity, polls
 from experiments.wire import faults as faults_module
-from experiments.wire.figures import AGAIN, bounded, missed, summarise
 
 NEVER = (0.0, 0.0)  # bound of what must never happen, on any machine: hanging, or moving beyond the limits
+MS = 1e3
+SHARE = 0.9  # least fraction of the line's rate
+AGE_MS, DRIFT_MS = 60.0, 10.0  # limits; a median over a third of the frames varies by about 3 ms
+BEYOND_MS = 25.0  # limit of p95 of a command, detection excluded
+SETTLED_S = 0.5  # limit of the time from a fault to a standing head, or to recovery
+LATENCY_MS = 10.0
+PARITY_STEPS = 1.0
+ROUNDING = 1e-6  # rounding of steps that were converted to angles
+PARTS = ("in_hand", "detection", "aiming", "line", "total", "beyond")
+PART_COLUMNS = ("median [ms]", "p95 [ms]", "max [ms]")
+FAULT_COLUMNS = (
+    "outcome", "settled [s]", "halted [s]", "recovered [s]", "moved [deg]", "beyond [deg]", "ended [s]", "hangs",
+    "tracebacks", "runs",
+)  # fmt: skip
+AGAIN = "measured"  # number of repetitions, in rows of what was measured more than once
+Figure = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class WireSettings(Settings):
-    """Settings: figures and durations of their measurement.
+    """Settings: figures and durations of their measurement."""
 
-    Attributes:
-        only: figures to measure.
-        poll_s: polling of one unit [s].
-        age_s: reading of the stream [s].
-        targets: targets that are followed to time commands.
-        command_s: following of each target [s].
-        faults: faults of the devices; all if empty.
-        repetitions: repetitions of each fault.
-        wiggle_s: turning of the head [s].
-        swing_s: swinging of the board [s].
-        places: places of the static book.
-        still_s: following at each place [s].
-        tries: largest number of measurements of a figure that a busy machine has disturbed.
-    """
-
-    only: tuple[str, ...] = ("polls", "age", "command", "faults", "latency", "parity")
-    poll_s: Positive = 10.0
-    age_s: Positive = 30.0
-    targets: tuple[str, ...] = ("book", "person")
-    command_s: Positive = 20.0
-    faults: tuple[str, ...] = ()
-    repetitions: Count = 1
-    wiggle_s: Positive = 8.0
-    swing_s: Positive = 10.0
-    places: Count = 2
-    still_s: Positive = 6.0
-    tries: Count = 1
+    only: tuple[str, ...] = ("polls", "age", "command", "faults", "latency", "parity")  # figures to measure
+    poll_s: Positive = 10.0  # polling of one unit [s]
+    age_s: Positive = 30.0  # reading of the stream [s]
+    targets: tuple[str, ...] = ("book", "person")  # targets that are followed to time commands
+    command_s: Positive = 20.0  # following of each target [s]
+    faults: tuple[str, ...] = ()  # faults of the devices; all if empty
+    repetitions: Count = 1  # repetitions of each fault
+    wiggle_s: Positive = 8.0  # turning of the head [s]
+    swing_s: Positive = 10.0  # swinging of the board [s]
+    places: Count = 2  # places of the static book
+    still_s: Positive = 6.0  # following at each place [s]
+    tries: Count = 1  # largest number of measurements of a figure that a busy machine has disturbed
 
     def __post_init__(self) -> None:
         """Refuse unknown faults."""
@@ -86,8 +91,6 @@ def _spoilt(rows: Sequence[Row]) -> bool:
     return bool(broken) and all(each.bound != NEVER for each in broken)
 
 
-__all__ = ["bounded", "missed", "summarise"]  # parts of the experiment
-
 RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
     "polls": lambda s, folder: polls.run(folder, s.poll_s),
     "age": lambda s, _: age.run(s.age_s, s.seed_base),
@@ -100,6 +103,120 @@ RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
 }
 
 
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Compute each figure, the parts of commands and ages, and the result of each fault."""
+    of = grouped(rows, "figure")
+    figures: dict[str, Figure] = {}
+    for row in of.get("polls", []):
+        figures[f"polls, {row['case']}"] = at_least(row["share"], SHARE, f"of {row['pairs_s'] / row['share']:.1f}/s")
+    if ages := of.get("age"):
+        age = np.array([row["age_s"] for row in ages]) * MS
+        thirds = [float(np.median(third)) for third in np.array_split(age, 3)]
+        figures["age of the newest frame, longest"] = at_most(float(age.max()), AGE_MS, "ms")
+        figures["age, last third less first"] = at_most(abs(thirds[2] - thirds[0]), DRIFT_MS, "ms")
+    for name, mine in grouped(of.get("command", []), "target").items():
+        beyond = float(np.percentile([row["beyond_s"] for row in mine], 95)) * MS
+        figures[f"command, {name}: p95 beyond detection"] = at_most(beyond, BEYOND_MS, "ms")
+    faults = {" ".join(name): _fault(mine) for name, mine in grouped(of.get("faults", []), "fault", "way").items()}
+    figures |= _of_faults(faults)
+    for row in of.get("latency", []):
+        off = abs(row["measured_s"] - row["truth_s"]) * MS
+        name = f"latency, {row['what']}: {row['measured_s'] * MS:.1f} for {row['truth_s'] * MS:.1f}, off"
+        figures[name] = at_most(off, LATENCY_MS, "ms")
+    if places := of.get("parity"):
+        apart = max(max(row["pan_steps"], row["tilt_steps"]) for row in places)
+        figures["parity, farthest apart"] = at_most(round(apart / ROUNDING) * ROUNDING, PARITY_STEPS, "steps")
+    loads = [row["load"] for row in rows]
+    return {
+        "figures": figures,
+        "parts": _parts(of),
+        "faults": faults,
+        "again": {name: again for name, mine in of.items() if (again := mine[0].get(AGAIN))},
+        "load": [min(loads, default=math.nan), max(loads, default=math.nan)],
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """List the figures that miss their goal."""
+    return [name for name, figure in summary["figures"].items() if not figure["reached"]]
+
+
+def bounded(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Give the measured values by names without values."""
+    return {
+        name.partition(":")[0] if name.startswith("latency") else name: figure["measured"]
+        for name, figure in summary["figures"].items()
+    }
+
+
+def at_most(measured: float, wanted: float, unit: str) -> Figure:
+    """Make a figure with an upper limit."""
+    return {"measured": measured, "wanted": f"<= {wanted:g}", "unit": unit, "reached": bool(measured <= wanted)}
+
+
+def at_least(measured: float, wanted: float, unit: str) -> Figure:
+    """Make a figure with a lower limit."""
+    return {"measured": measured, "wanted": f">= {wanted:g}", "unit": unit, "reached": bool(measured >= wanted)}
+
+
+def _parts(of: dict[str, list[Row]]) -> dict[str, dict[str, float]]:
+    """Give median, p95 and longest of the parts of a command and of an age."""
+    values = {
+        f"{name}: {part}": [row[f"{part}_s"] for row in mine]
+        for name, mine in grouped(of.get("command", []), "target").items()
+        for part in PARTS
+    }
+    values |= {f"age: {part}": [row[f"{part}_s"] for row in of["age"]] for part in ("age", "read") if "age" in of}
+    return {
+        name: dict(
+            zip(PART_COLUMNS, (float(v) * MS for v in (np.median(x), np.percentile(x, 95), max(x))), strict=True)
+        )
+        for name, x in values.items()
+    }
+
+
+def _fault(rows: Sequence[Row]) -> dict[str, Any]:
+    """Give the worst of a fault's repetitions."""
+
+    def worst(name: str) -> float:
+        values = [math.nan if row.get(name) is None else float(row[name]) for row in rows]
+        return float(np.nanmax(values)) if np.isfinite(values).any() else math.nan
+
+    # A run that never followed cannot have settled.
+    started = all(row.get("settled_s") is not None for row in rows)
+    said = (
+        "/".join(sorted({row["outcome"] for row in rows})),
+        worst("settled_s") if started else math.inf,
+        worst("halted_s"),
+        worst("recovered_s"),
+        worst("moved_deg"),
+        worst("beyond_deg"),
+        worst("ended_s"),
+        sum(row.get("hang") or 0 for row in rows),
+        sum(row.get("traceback") or 0 for row in rows),
+        len(rows),
+    )
+    return dict(zip(FAULT_COLUMNS, said, strict=True))
+
+
+def _of_faults(faults: dict[str, dict[str, Any]]) -> dict[str, Figure]:
+    if not faults:
+        return {}
+    late = sum(not fault["settled [s]"] <= SETTLED_S for fault in faults.values())
+    worst = {
+        "from a fault to a standing head or recovery, longest": ("settled [s]", SETTLED_S, "s"),
+        "motion beyond the soft limits after a fault": ("beyond [deg]", 0.0, "degrees"),
+    }
+    found = {
+        name: at_most(max(f[column] for f in faults.values()), most, unit)
+        for name, (column, most, unit) in worst.items()
+    }
+    found[f"faults of {len(faults)} for which that took longer"] = at_most(late, 0, "faults")
+    for column in ("hangs", "tracebacks"):
+        found[f"{column} after a fault"] = at_most(sum(f[column] for f in faults.values()), 0, "runs")
+    return found
+
+
 SETTINGS = WireSettings(seeds=1)
 QUICK = replace(
     SETTINGS,
@@ -108,7 +225,6 @@ QUICK = replace(
     targets=("book",),
     command_s=6.0,
     faults=("head.silence", "fixed.stall"),
-    repetitions=1,
     wiggle_s=5.0,
     swing_s=6.0,
     places=1,

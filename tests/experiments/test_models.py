@@ -12,7 +12,7 @@ from cotarget.schema import validate
 from experiments.calibration import calibration_budget
 from experiments.calibration.synthetic.aims import looking_off
 from experiments.calibration.synthetic.rig import Lens, Truth
-from experiments.following import depth_error, models, regimes, shortcut
+from experiments.following import depth_error, models, shortcut
 from experiments.following.mounted import (
     MOUNTED_DEG,
     at,
@@ -148,7 +148,7 @@ def error_rows(ratios, baseline=1.0):
 
 def test_the_regime_reaches_as_far_as_the_full_model_is_five_times_better():
     rows = error_rows({5.0: 40.0, 10.0: 20.0, 50.0: 5.0, 100.0: 4.9, 200.0: 6.0})
-    assert regimes.regime(rows, "seen") == (5.0, 50.0)
+    assert models.regime(rows, "seen") == (5.0, 50.0)
     summary = models.summarise(rows)
     assert models.missed(summary) == []
     none = models.missed(models.summarise(error_rows({5.0: 4.0, 10.0: 20.0})))
@@ -168,14 +168,14 @@ def test_targets_at_the_depth_of_the_zeros_alone_leave_a_picture():
 def test_of_depths_and_baselines_with_the_same_reach_the_worst_counts(first):
     good, bad = error_rows({5.0: 40.0, 10.0: 20.0, 20.0: 9.0}), error_rows({20.0: 4.0}, baseline=2.0)
     rows = good + bad if first else bad + good
-    assert regimes.regime(rows, "exact") == (5.0, 5.0)
-    assert [float(v[0]) for v in regimes.ratios(rows, "exact").values()] == pytest.approx([40.0, 4.0, 9.0])
+    assert models.regime(rows, "exact") == (5.0, 5.0)
+    assert [float(v[0]) for v in models.ratios(rows, "exact").values()] == pytest.approx([40.0, 4.0, 9.0])
 
 
 def test_reach_is_depth_over_baseline_or_from_the_zeros_depth():
-    assert regimes.reach(20.0, 0.4) == pytest.approx(50.0)
-    assert regimes.reach(20.0, 0.4, 50.0) == pytest.approx(1 / (0.4 * 0.03))
-    assert regimes.reach(50.0, 0.4, 50.0) == math.inf
+    assert models.reach(20.0, 0.4) == pytest.approx(50.0)
+    assert models.reach(20.0, 0.4, 50.0) == pytest.approx(1 / (0.4 * 0.03))
+    assert models.reach(50.0, 0.4, 50.0) == math.inf
 
 
 def test_a_depth_error_turns_the_line_of_sight_by_the_baseline_over_the_depth():

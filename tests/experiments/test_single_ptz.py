@@ -12,9 +12,8 @@ from cotarget.rig import Frame
 from cotarget.sim.truth import Outlines
 from cotarget.sim.world import SimWorld
 from experiments.following import single_ptz, single_runs
-from experiments.following.lone_camera import COAST_S, LoneCamera, scan_of
-from experiments.following.lone_course import SEARCH_S, Course, Sighting
-from experiments.following.shaken import Shaken
+from experiments.following.lone_camera import COAST_S, SEARCH_S, Course, LoneCamera, Sighting, scan_of
+from experiments.following.single_runs import Shaken
 
 BOOK = DEFAULT_TARGETS["book"]
 STEP = 0.04

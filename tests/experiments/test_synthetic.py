@@ -9,7 +9,8 @@ from cotarget.geometry import RigidTransform, pose
 from experiments.calibration import random_rigs
 from experiments.calibration.synthetic.aims import aimed
 from experiments.calibration.synthetic.rig import SIZE, Lens, Stop, Truth, undistorted, with_lever_shifted
-from experiments.calibration.synthetic.views import Placing, spread_views, views_at_stops
+from experiments.calibration.synthetic.views import Placing, spread_views
+from tests.support.synthetic_calibration import views_at_stops
 
 STILL = RigidTransform.identity()
 PLAIN = Lens(500.0, 500.0, 320.0, 240.0)

@@ -8,8 +8,8 @@ import pytest
 
 from experiments.wire import age, command, faults, latency, wire
 from experiments.wire.command import Notes, Turn
-from experiments.wire.figures import bounded, missed, summarise
 from experiments.wire.rig import Tap
+from experiments.wire.wire import bounded, missed, summarise
 
 # Nothing here is a figure: the machine may be busy, and experiments/expected/wire.json is as patient. What is a third
 # of the line's rate is still polling.

@@ -7,13 +7,14 @@ from cotarget.calibration import Options, View, calibrate_views, predicted_point
 from cotarget.calibration.bundle import ALL_BLOCKS, fit
 from cotarget.calibration.initialization import place_boards
 from cotarget.config import BoardConfig
-from experiments.calibration.synthetic.aims import draw_targets, misses
+from experiments.calibration.synthetic.aims import aimed, draw_targets, misses
 from experiments.calibration.synthetic.rig import SIZES
-from experiments.calibration.synthetic.views import Placing, noisy, placed, spread_views, views_at_stops, zoom_view
+from experiments.calibration.synthetic.views import Placing, noisy, placed, spread_views, zoom_view
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
 NOISE_PX = 0.1
+FEWEST_CORNERS = 12  # least corners of a board in partial view, at a longer focal length
 TARGETS = 40
 # One calibration's pointing error is one draw of the few directions of the parameters that matter.
 POINTING_FACTOR = 3.0
@@ -23,6 +24,20 @@ def drawn(truth, seed=0, boards=10, looks=3, noise_px=NOISE_PX):
     """Views of placements all over both images."""
     placing = Placing(boards=boards, looks=looks)
     return spread_views(truth, POINTS, np.random.default_rng((seed, 3)), noise_px, placing)
+
+
+def views_at_stops(truth, placements, rng, noise_px=NOISE_PX, looks=2):
+    """Views at the further zoom samples of boards (N, 3) in the fixed camera's frame, perhaps in part."""
+    views, before = [], np.zeros(2)
+    for stop in truth.stops:
+        for number, x_fixed in enumerate(placements):
+            for _ in range(looks):
+                reported = aimed(truth, x_fixed[rng.integers(len(x_fixed))][None], np.array([0.0, 0.0, 1.0]))[0]
+                view = zoom_view(truth, x_fixed, number, reported, before, noise_px, rng, stop)
+                if np.isfinite(reported).all() and view.seen.sum() >= FEWEST_CORNERS:
+                    views.append(view)
+                    before = reported
+    return views
 
 
 def drawn_at_stops(truth, rng, placing, **looks):

@@ -30,14 +30,9 @@ def draw_targets(
 
 
 def aim(calibration: Calibration, x_fixed: Array) -> Array:
-    """Solve pan and tilt that centre points in the zoom image by the calibration, numerically.
+    """Solve pan and tilt that centre points (n, 3) [m] in the zoom image by a calibration, numerically.
 
-    Args:
-        calibration: calibration that is taken as true.
-        x_fixed: points in the fixed camera's frame [m], (3,) or (n, 3).
-
-    Returns:
-        Angles as the head reports them [rad], (2,) or (n, 2); nan where there is no such pose.
+    Angles are those that the head reports [rad], (n, 2), or (2,) for one point (3,); nan where there is no such pose.
     """
     head = calibration.zoom_head.axes
     model = truth_of(calibration)
@@ -105,20 +100,9 @@ def misses(
 ) -> Array:
     """Measure the angles between the true zoom camera's line of sight and true targets in turn, (n,) [rad].
 
-    Pixel and depth are known exactly, and the head executes commands as the true one does. The line of sight is the
-    true ray through the image's centre at the shortest focal length.
-
-    Args:
-        calibration: calibration that gives the commands.
-        truth: the rig.
-        pixels: targets in the fixed view, (n, 2).
-        depths: depths of the targets [m], (n,).
-        rng: source of the head's jitter.
-        by_distance: whether the calibration gets the targets' distance in place of their depth, for true lenses of
-            another model, whose axis the calibration cannot know.
-
-    Returns:
-        Angles; nan where the calibration finds no pose.
+    Pixels (n, 2) and depths (n,) [m] are known exactly, and the head executes the calibration's commands as the true
+    one does, with jitter from ``rng``. With ``by_distance`` the calibration gets distances in place of depths, for true
+    lenses of another model, whose axis it cannot know. An angle is nan where the calibration finds no pose.
     """
     x_true = np.c_[undistorted(pixels, truth.fixed), np.ones(len(pixels))] * depths[:, None]
     x_believed = calibration.fixed.ray(pixels) * depths[:, None]
@@ -128,16 +112,10 @@ def misses(
 
 
 def looking_off(truth: Truth, x_fixed: Array, q: Array, rng: np.random.Generator | None = None) -> Array:
-    """Measure the angles between the true zoom camera's line of sight and points in turn, (n,) [rad].
+    """Measure the angles between the true zoom camera's line of sight and points (n, 3) [m] in turn, (n,) [rad].
 
-    Args:
-        truth: the rig; the line of sight is the true ray through its image's centre at the shortest focal length.
-        x_fixed: points in the fixed camera's frame [m], (n, 3).
-        q: pan and tilt commanded for each of them [rad], (n, 2).
-        rng: source of the head's jitter.
-
-    Returns:
-        Angles; nan where q is nan.
+    The head is sent to each row of q (n, 2) [rad]; nan where q is nan. The line of sight is the true ray through the
+    image's centre at the shortest focal length.
     """
     before = np.concatenate([np.zeros((1, 2)), q[:-1]])
     stood = np.array([truth.stands(*pair, rng) for pair in zip(q, before, strict=True)])

@@ -25,24 +25,15 @@ DIFFERENCE = 1e-6  # step of central differences
 
 @dataclass(frozen=True)
 class Lens:
-    """True intrinsics.
+    """True intrinsics."""
 
-    Attributes:
-        fx: focal length along the rows [px].
-        fy: focal length along the columns [px].
-        cx: principal point along u [px].
-        cy: principal point along v [px].
-        distortion: OpenCV's coefficients: 4, 5, 8 (rational) or 12 (thin prism); with ``fisheye`` the 4 of
-            `cv2.fisheye`.
-        fisheye: whether the coefficients are those of `cv2.fisheye`.
-    """
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    fx: float  # focal length along the rows [px]
+    fy: float  # focal length along the columns [px]
+    cx: float  # principal point along u [px]
+    cy: float  # principal point along v [px]
+    # OpenCV's coefficients: 4, 5, 8 (rational) or 12 (thin prism); with ``fisheye`` the 4 of `cv2.fisheye`.
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    fisheye: bool = False
+    fisheye: bool = False  # whether the coefficients are those of `cv2.fisheye`
 
     @property
     def K(self) -> Array:
@@ -83,46 +74,29 @@ class Truth:
     """Whole rig, with explicit matrices of its head.
 
     The matrices take the axes' true angles; `stands` gives these from the reported ones.
-
-    Attributes:
-        fixed: lens of the fixed camera.
-        zoom: lens of the zoom camera at its shortest focal length.
-        gamma: T_zoom0_fixed.
-        hand: T_head_zoom.
-        dz: offset from the pan axis to the tilt axis [m].
-        eps: deviation of the tilt axis from a right angle with the pan axis [rad].
-        stops: further zoom samples.
-        pan_scale: true over reported pan.
-        tilt_scale: true over reported tilt.
-        sag: deflection of the tilt by the camera's weight at level tilt [rad].
-        play: backlash of both axes [rad]; they lag by half of it.
-        jitter: standard deviation of an axis's position, drawn for every move [rad].
-        give: shift of the camera on the head per radian of tilt [m].
     """
 
-    fixed: Lens = Lens(686.0, 684.0, 325.0, 239.0, (-0.2, 0.0, 0.0, 0.0, 0.0))
+    fixed: Lens = Lens(686.0, 684.0, 325.0, 239.0, (-0.2, 0.0, 0.0, 0.0, 0.0))  # lens of the fixed camera
+    # Lens of the zoom camera at its shortest focal length.
     zoom: Lens = Lens(692.0, 693.0, 326.0, 235.0, (-0.1, 0.0, 0.0, 0.0, 0.0))
-    gamma: RigidTransform = DEFAULT_GAMMA
-    hand: RigidTransform = DEFAULT_T
-    dz: float = 0.005
-    eps: float = np.radians(0.1)
-    stops: tuple[Stop, ...] = ()
-    pan_scale: float = 1.0
-    tilt_scale: float = 1.0
-    sag: float = 0.0
-    play: float = 0.0
-    jitter: float = 0.0
-    give: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gamma: RigidTransform = DEFAULT_GAMMA  # T_zoom0_fixed
+    hand: RigidTransform = DEFAULT_T  # T_head_zoom
+    dz: float = 0.005  # offset from the pan axis to the tilt axis [m]
+    eps: float = np.radians(0.1)  # deviation of the tilt axis from a right angle with the pan axis [rad]
+    stops: tuple[Stop, ...] = ()  # further zoom samples
+    pan_scale: float = 1.0  # true over reported pan
+    tilt_scale: float = 1.0  # true over reported tilt
+    sag: float = 0.0  # deflection of the tilt by the camera's weight at level tilt [rad]
+    play: float = 0.0  # backlash of both axes [rad]; they lag by half of it
+    jitter: float = 0.0  # standard deviation of an axis's position, drawn for every move [rad]
+    give: tuple[float, float, float] = (0.0, 0.0, 0.0)  # shift of the camera on the head per radian of tilt [m]
 
     def stands(
         self, reported: Array, before: Array | None = None, rng: np.random.Generator | None = None
     ) -> tuple[float, float]:
-        """Give the axes' true pan and tilt [rad].
+        """Give the axes' true pan and tilt [rad] for the reported ones, (2,) [rad].
 
-        Args:
-            reported: pan and tilt reported by the head [rad], (2,).
-            before: reported pan and tilt before the move, for the backlash [rad], (2,).
-            rng: source of the jitter.
+        Backlash acts where the pose before the move is given, jitter where its source is.
         """
         true = np.array([self.pan_scale, self.tilt_scale]) * np.asarray(reported, float)
         if before is not None:

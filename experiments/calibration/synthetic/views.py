@@ -1,6 +1,5 @@
 """Views of calibration boards by a synthetic rig's cameras."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -18,13 +17,13 @@ BOARD_DEPTHS = (2.5, 8.0)  # [m]
 MARGIN_PX = 40.0  # least distance of a board's centre from the border of the fixed image
 # Limits of the head in use: pan and tilt [rad].
 HEAD_LIMITS = ((np.radians(-158.9), np.radians(158.9)), (np.radians(-46.6), np.radians(31.1)))
+TURNED = np.radians(45.0)  # largest rotation of a board from facing halfway between both cameras [rad]
 CELLS = (5, 3)  # grid of the fixed view, columns and rows, over which boards are spread
 CELL_STEP = 7  # step between successive cells, so that a few boards are spread too
 FLATTEST = np.cos(np.radians(65.0))  # largest viewing angle at which a board is found
 FARTHER = 0.03  # relative increase of the depth of a board that is not wholly visible
 GOLDEN = (np.sqrt(5) - 1) / 2  # multiples of it, modulo 1, are evenly spread for any count
 LOOKS_DRAWN = 80  # head poses drawn, of which those far apart are chosen
-FEWEST_CORNERS = 12  # least corners of a board in partial view, at a longer focal length
 TRIES = 200  # head poses drawn per placement
 PLACEMENT_TRIES = 100_000
 Boards = Annotated[int, Ge(FEWEST_VIEWS)]  # as many placements as determine a camera's intrinsics
@@ -40,9 +39,7 @@ def synthetic_views(
     moved: int = 3,
     pan_range: float = 0.5,
     tilt_range: float = 0.4,
-    far: float = BOARD_DEPTHS[1],
     shape: Array | None = None,
-    first: int = 0,
 ) -> list[View]:
     """Make views of boards at random poses in the fixed view, with the head at home and moved.
 
@@ -55,18 +52,16 @@ def synthetic_views(
         moved: number of head poses per placement, besides home where the zoom camera sees the board from there.
         pan_range: largest pan to either side [rad].
         tilt_range: largest tilt to either side [rad].
-        far: largest depth [m].
         shape: true corners of the board [m], (N, 3); by default the nominal ones.
-        first: number of the first placement.
     """
     views: list[View] = []
     center = points.mean(axis=0)
     true_points = points if shape is None else shape
-    number, stood = first, np.zeros(2)
+    number, stood = 0, np.zeros(2)
     for _ in range(PLACEMENT_TRIES):
-        if number == first + boards:
+        if number == boards:
             break
-        depth = np.exp(rng.uniform(np.log(BOARD_DEPTHS[0]), np.log(far)))
+        depth = np.exp(rng.uniform(*np.log(BOARD_DEPTHS)))
         uv = rng.uniform(MARGIN_PX, np.array(SIZE) - MARGIN_PX)
         ray = np.array([(uv[0] - truth.fixed.cx) / truth.fixed.fx, (uv[1] - truth.fixed.cy) / truth.fixed.fy, 1.0])
         R = Rotation.from_rotvec(np.radians(rng.uniform([-35, -35, -20], [35, 35, 20])))
@@ -88,25 +83,13 @@ def synthetic_views(
 
 @dataclass(frozen=True)
 class Placing:
-    """Placement of boards and head poses.
+    """Placement of boards and head poses."""
 
-    Attributes:
-        boards: number of placements, one in each cell of the fixed view in turn.
-        looks: head poses per placement, as far apart as the zoom camera's view and the head's limits allow; home is
-            among them where the zoom camera sees the board from there.
-        depths: range of depths, even in the logarithm [m].
-        turned: largest rotation of a board from facing halfway between both cameras [rad].
-        limits: limits of pan and tilt [rad].
-    """
-
-    boards: int = 15
+    boards: int = 15  # number of placements, one in each cell of the fixed view in turn
+    # Head poses per placement, as far apart as the zoom camera's view and the head's limits allow; home is among them
+    # where the zoom camera sees the board from there.
     looks: int = 4
-    depths: tuple[float, float] = BOARD_DEPTHS
-    turned: float = np.radians(45.0)
-    limits: tuple[tuple[float, float], tuple[float, float]] = HEAD_LIMITS
-
-
-DEFAULT_PLACING = Placing()
+    depths: tuple[float, float] = BOARD_DEPTHS  # range of depths, even in the logarithm [m]
 
 
 def spread_views(
@@ -114,18 +97,12 @@ def spread_views(
     points: Array,
     rng: np.random.Generator,
     noise_px: float,
-    placing: Placing = DEFAULT_PLACING,
+    placing: Placing,
     shape: Array | None = None,
 ) -> list[View]:
     """Make views of boards over the whole fixed view, each from head poses that spread it over the zoom view.
 
-    Args:
-        truth: the rig.
-        points: nominal corners of the board [m], (N, 3).
-        rng: source of all random values.
-        noise_px: standard deviation of a corner's coordinate.
-        placing: placement of boards and head poses.
-        shape: true corners of the board [m], (N, 3); by default the nominal ones.
+    Arguments are those of `synthetic_views`.
 
     Raises:
         AssertionError: there is no room for a board.
@@ -158,7 +135,7 @@ def placed(truth: Truth, points: Array, rng: np.random.Generator, placing: Placi
         cell = np.array([column, row]) + rng.uniform(0, 1, 2) if i < TRIES else rng.uniform([0, 0], CELLS)
         x = np.append(undistorted(cell / CELLS * (np.array(SIZE) - 1.0), truth.fixed), 1.0) * np.exp(depth)
         facing = _unit(_unit(x) + _unit(x - zoom_at))
-        turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3) * placing.turned)
+        turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3) * TURNED)
         x_fixed = (turn * _towards(facing)).apply(centered) + x
         normal = turn.apply(facing)
         sideways = min(normal @ _unit(x), normal @ _unit(x - zoom_at)) < FLATTEST
@@ -166,8 +143,8 @@ def placed(truth: Truth, points: Array, rng: np.random.Generator, placing: Placi
             depth = min(depth + FARTHER, far) if depth < far else rng.uniform(near, far)
             continue
         looking = np.concatenate([np.zeros((1, 2)), _looks(truth, x, rng)])
-        inside = ((looking >= np.array(placing.limits)[:, 0]) & (looking <= np.array(placing.limits)[:, 1])).all(axis=1)
-        seen = looking[inside]
+        low, high = np.array(HEAD_LIMITS).T
+        seen = looking[((looking >= low) & (looking <= high)).all(axis=1)]
         seen = seen[seen_from(truth, x_fixed, seen)]
         if len(seen) >= placing.looks:
             return x_fixed, _apart(seen, placing.looks)
@@ -219,15 +196,7 @@ def zoom_view(
 ) -> View:
     """Make the zoom camera's view of a board's corners (N, 3), perhaps in part, at a reported head pose.
 
-    Args:
-        truth: the rig.
-        x_fixed: true corners in the fixed frame [m], (N, 3).
-        number: number of the placement.
-        reported: reported pan and tilt [rad], (2,).
-        before: reported pan and tilt before the move [rad], (2,).
-        noise_px: standard deviation of a corner's coordinate.
-        rng: source of noise and jitter.
-        stop: zoom sample; the shortest focal length by default.
+    Poses are (2,) [rad]; without a zoom sample it is at the shortest focal length.
     """
     lens, pupil, nominal = (truth.zoom, 0.0, NOMINAL_PX) if stop is None else (stop.lens, stop.pupil, stop.nominal_px)
     x = truth.in_zoom(x_fixed, *truth.stands(reported, before, rng)) - [0.0, 0.0, pupil]
@@ -235,31 +204,6 @@ def zoom_view(
     if stop is not None:
         px = np.where(lens.inside(x)[:, None], px, np.nan)
     return View("zoom", px, number, float(reported[0]), float(reported[1]), focal_px=nominal)
-
-
-def views_at_stops(
-    truth: Truth, placements: Sequence[Array], rng: np.random.Generator, noise_px: float = 0.1, looks: int = 2
-) -> list[View]:
-    """Make views of boards at the further zoom samples, in part where a board is larger than the image.
-
-    Args:
-        truth: the rig, with zoom samples.
-        placements: corners of each placement in the fixed camera's frame [m], (N, 3), numbered from 0.
-        rng: source of the corner that is centred, and of the noise.
-        noise_px: standard deviation of a corner's coordinate.
-        looks: head poses per placement and zoom sample.
-    """
-    views: list[View] = []
-    before = np.zeros(2)
-    for stop in truth.stops:
-        for number, x_fixed in enumerate(placements):
-            for _ in range(looks):
-                reported = aimed(truth, x_fixed[rng.integers(len(x_fixed))][None], np.array([0.0, 0.0, 1.0]))[0]
-                view = zoom_view(truth, x_fixed, number, reported, before, noise_px, rng, stop)
-                if np.isfinite(reported).all() and view.seen.sum() >= FEWEST_CORNERS:
-                    views.append(view)
-                    before = reported
-    return views
 
 
 def noisy(corners_px: Array, noise_px: float, rng: np.random.Generator) -> Array:
