@@ -319,7 +319,7 @@ def _closed_form(target: Triple[Any], d: Triple[Any], t: Triple[Any], sign: Any,
     for _ in range(1 if dz == 0 else CLOSED_FORM_ROUNDS):
         # |x_base|^2 = dz^2 + 2 dz z_tilted + |q|^2 with q = r d + t: a quadratic in the range r
         reach = lib.sqrt(along * along + free - 2 * dz * ahead) - along
-        qx, qy, qz = (reach * along_d + from_t for along_d, from_t in zip(d, t, strict=True))
+        qx, qy, qz = reach * d[0] + t[0], reach * d[1] + t[1], reach * d[2] + t[2]
         on_axis = cos_eps * qx + sin_eps * qy
         y, z, height = qy - on_axis * sin_eps, cos_eps * qz, b - on_axis * sin_eps
         left = y * y + z * z - height * height
@@ -335,17 +335,16 @@ def _newton_step(
 ) -> tuple[Triple[Any], Any, Triple[Any]]:  # fmt: skip
     """Compute the residual of Eq. 5 [m], the determinant of its Jacobian, and Newton's step times that determinant.
 
-    The unknowns are (pan, tilt, range); the step is by Cramer's rule.
+    The unknowns are (pan, tilt, range); the step is by Cramer's rule. All vectors are turned back by pan, which changes
+    neither lengths nor determinants.
     """
-    q = _tilt((reach * d[0] + t[0], reach * d[1] + t[1], reach * d[2] + t[2]), cos_tilt, sin_tilt, head)
-    reached = _pan((q[0], q[1], q[2] + head.axis_offset), cos_pan, sin_pan)
-    residual = (reached[0] - target[0], reached[1] - target[1], reached[2] - target[2])
-    by_pan = (reached[2], 0.0, -reached[0])
-    by_tilt = _pan(_about_tilt_axis(q, head), cos_pan, sin_pan)
-    by_reach = _pan(_tilt(d, cos_tilt, sin_tilt, head), cos_pan, sin_pan)
-    normal = _cross(by_tilt, by_reach)
-    steps = _dot(residual, normal), _dot(by_pan, _cross(residual, by_reach)), _dot(by_pan, _cross(by_tilt, residual))
-    return residual, _dot(by_pan, normal), steps
+    x, y, z = q = _tilt((reach * d[0] + t[0], reach * d[1] + t[1], reach * d[2] + t[2]), cos_tilt, sin_tilt, head)
+    a, b, c = _pan(target, cos_pan, -sin_pan)
+    ahead = z + head.axis_offset
+    residual = x - a, y - b, ahead - c
+    by_pan, by_tilt, by_reach = (ahead, 0.0, -x), _about_tilt_axis(q, head), _tilt(d, cos_tilt, sin_tilt, head)
+    steps = _det(residual, by_tilt, by_reach), _det(by_pan, residual, by_reach), _det(by_pan, by_tilt, residual)
+    return residual, _det(by_pan, by_tilt, by_reach), steps
 
 
 def _pan(v: Triple[Any], cos: Any, sin: Any) -> Triple[Any]:
@@ -367,12 +366,9 @@ def _about_tilt_axis(v: Triple[Any], head: HeadGeometry) -> Triple[Any]:
     return y_axis * v[2], -x_axis * v[2], x_axis * v[1] - y_axis * v[0]
 
 
-def _cross(a: Triple[Any], b: Triple[Any]) -> Triple[Any]:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _dot(a: Triple[Any], b: Triple[Any]) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def _det(a: Triple[Any], b: Triple[Any], c: Triple[Any]) -> Any:
+    """Compute the determinant of three columns."""
+    return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
 
 
 def shortcut(

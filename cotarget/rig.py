@@ -85,12 +85,12 @@ class PanTiltLimits:
         Raises:
             DeviceError: a speed is not above zero.
         """
-        both = speed if isinstance(speed, tuple) else (speed, speed)
-        for each in both:
+        capped = []
+        for each in speed if isinstance(speed, tuple) else (speed, speed):
             if each is not None and not each > 0:
                 raise DeviceError(f"the head cannot move at a speed of {each} rad/s")
-        pan, tilt = (self.speed if each is None else min(each, self.speed) for each in both)
-        return pan, tilt
+            capped.append(self.speed if each is None else min(each, self.speed))
+        return capped[0], capped[1]
 
     def allow(self, pan: npt.ArrayLike, tilt: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Whether angles [rad] are within the limits; nan is not."""

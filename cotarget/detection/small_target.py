@@ -183,10 +183,11 @@ class History:
     def references(self, t: float) -> list[tuple[Image, Array] | None]:
         """Return the image nearest to each of `AGES_S`, with its shift; None for an age without an image."""
         found: list[tuple[Image, Array] | None] = []
+        ages = t - np.array([kept[0] for kept in self._kept])
         for age in AGES_S:
-            best = min(self._kept, key=lambda kept: abs(t - kept[0] - age), default=None)
-            near = best is not None and abs(t - best[0] - age) <= AGE_TOLERANCE * age
-            found.append((best[1], best[2]) if best is not None and near else None)
+            off = np.abs(ages - age)
+            near = off.size and off.min() <= AGE_TOLERANCE * age
+            found.append(self._kept[int(off.argmin())][1:] if near else None)
         return found
 
 
@@ -219,7 +220,7 @@ def change(
     left, top = max(0, low[0] - MARGIN_PX), max(0, low[1] - MARGIN_PX)
     patch = grey[top : low[1] + size[1] + MARGIN_PX, left : low[0] + size[0] + MARGIN_PX]
     h, w = patch.shape
-    du, dv = (float(x) for x in shift_then - shift)
+    du, dv = (shift_then - shift).tolist()
     # getRectSubPix takes the centre of a patch: n pixels from column x are centred at x + (n - 1) / 2.
     u, v = left + (w - 1) / 2 + du, top + (h - 1) / 2 + dv
     if not ((w - 1) / 2 <= u + 0.5 and u - 0.5 <= grey.shape[1] - (w + 1) / 2):
@@ -383,7 +384,7 @@ def _outline(grey: Image, peak: tuple[int, int], scale: int, signal: float, arou
         around: mean grey level of the surroundings.
     """
     factor = 2**scale
-    u, v = (factor * x + factor // 2 for x in peak)
+    u, v = factor * peak[0] + factor // 2, factor * peak[1] + factor // 2
     reach = factor * GUARD_HALF_PX
     left, top = max(0, u - reach), max(0, v - reach)
     window = grey[top : v + reach + 1, left : u + reach + 1].astype(np.float32) - np.float32(around)
@@ -393,7 +394,7 @@ def _outline(grey: Image, peak: tuple[int, int], scale: int, signal: float, arou
     _, labels, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8))
     j, i = np.unravel_index(int(np.argmax(np.abs(near))), near.shape)
     label = labels[max(0, v - top - factor) + int(j), max(0, u - left - factor) + int(i)]
-    x, y, w, h = (int(n) for n in stats[label][:4])
+    x, y, w, h = stats[label][:4].tolist()
     cut = (x == 0 and left > 0, y == 0 and top > 0, x + w == window.shape[1] and left + x + w < grey.shape[1])
     if label == 0 or any(cut) or (y + h == window.shape[0] and top + y + h < grey.shape[0]):
         return None  # it goes on beyond its ring: a pole, or a target for the next scale
