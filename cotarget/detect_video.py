@@ -1,20 +1,36 @@
-"""Run the fixed camera's detector and tracker on a film; write a table of tracks, and the film with tracks drawn."""
+"""Run the fixed camera's detector and tracker on films; write tables of tracks, and films with the tracks drawn.
 
+`run_on_folder` scores a folder of films by labels, and shows the worst mistakes on a contact sheet.
+"""
+
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.detection import make_detector
-from cotarget.drawing import draw_box
-from cotarget.errors import CotargetError
+from cotarget.drawing import draw_box, write_picture
+from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
 from cotarget.parallel import Progress
 from cotarget.rig import Image
+from cotarget.track_metrics import (
+    LEARNING_FRAMES,
+    Criterion,
+    Mistake,
+    match_frames,
+    mistakes,
+    pooled,
+    read_labels,
+    read_tracks,
+    score_tracks,
+)
 from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film, FilmWriter
@@ -143,3 +159,114 @@ class Trails:
             cv2.polylines(image, [way.reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA)
             draw_box(image, track.center_px, track.size_px, colour, str(track.id), bold=track.missed == 0)
         return image
+
+
+# Folders of films
+
+FILMS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
+LABEL_FILES = (".csv", ".txt")
+# Tiles of the contact sheet: side [px], number in a row, and most tiles of a kind.
+TILE_PX, ACROSS, MOST_TILES = 200, 6, 30
+CUTOUT = 3.0  # side of what a tile shows over the box's larger side
+LEAST_CUTOUT_PX = 60.0
+MISSED, FALSE = (80, 220, 60), (60, 60, 255)
+
+
+def labelled_films(folder: Path, labels: Path) -> list[tuple[Path, Path]]:
+    """Pair the films of a folder with the files of labels of the same name, by name.
+
+    Raises:
+        ConfigError: there is no film, or a film has no labels.
+    """
+    pairs = []
+    for film in sorted(each for each in folder.iterdir() if each.suffix.lower() in FILMS):
+        files = [labels / f"{film.stem}{suffix}" for suffix in LABEL_FILES]
+        found = next((file for file in files if file.is_file()), None)
+        if found is None:
+            raise ConfigError(f"{film}: has no labels; give {files[0]}, or {files[1].name} of the MOT-challenge")
+        pairs.append((film, found))
+    if not pairs:
+        raise ConfigError(f"{folder}: holds no film; give a folder with {', '.join(FILMS)}")
+    return pairs
+
+
+def run_on_folder(
+    films: Sequence[tuple[Path, Path]],
+    target: TargetProfile,
+    tables: Path,
+    sheet: Path | None = None,
+    criterion: Criterion | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Detect and track a target in films and score the tracks.
+
+    Args:
+        films: films and their files of labels, see `labelled_films`.
+        target: target profile.
+        tables: folder of the tables of tracks, one for each film.
+        sheet: picture to write, with the longest misses (green) and false tracks (red); None for none.
+        criterion: when a track is on a label; its defaults by default.
+        progress: called before every film with (films done, films in all, what).
+
+    Returns:
+        "pooled": scores over all films; "films": summary and score of each film, by its name.
+
+    Raises:
+        CotargetError: a film or its labels cannot be read, or a file cannot be written.
+    """
+    criterion = criterion or Criterion()
+    results, scores, tiles, minutes = {}, [], [], 0.0
+    labels = [read_labels(file) for _, file in films]
+    for i, ((film, _), boxes) in enumerate(zip(films, labels, strict=True)):
+        if progress is not None:
+            progress(i, len(films), film.stem)
+        table = tables / f"{film.stem}.csv"
+        summary = run_on_film(film, target, table)
+        tracks, frames = read_tracks(table), summary.last_frame + 1
+        score = score_tracks(tracks, boxes, summary.rate_hz, frames, criterion=criterion)
+        scores.append(score)
+        minutes += frames / summary.rate_hz / 60
+        results[film.stem] = dataclasses.asdict(summary) | dataclasses.asdict(score)
+        matches = [each for each in match_frames(tracks, boxes, criterion) if LEARNING_FRAMES <= each.frame < frames]
+        tiles += [(film, mistake) for mistake in mistakes(matches)]
+    if sheet is not None:
+        write_picture(sheet, contact_sheet(tiles))
+    return {"pooled": pooled(scores, minutes), "films": results}
+
+
+def contact_sheet(found: Sequence[tuple[Path, Mistake]]) -> Image:
+    """Draw the longest runs of missed targets and then of false tracks, as cutouts of their films."""
+    chosen: list[tuple[Path, Mistake]] = []
+    for kind in ("missed", "false"):
+        of_kind = sorted((each for each in found if each[1].kind == kind), key=lambda each: -each[1].frames)
+        chosen += of_kind[:MOST_TILES]
+    tiles: dict[int, Image] = {}
+    for path in {film for film, _ in chosen}:
+        wanted = {i: mistake for i, (film, mistake) in enumerate(chosen) if film == path}
+        last = max(mistake.frame for mistake in wanted.values())
+        with Film(path) as film:
+            for frame in film:
+                tiles |= {i: _tile(frame.image, path, m) for i, m in wanted.items() if m.frame == film.number}
+                if film.number >= last:
+                    break
+    rows = -(-len(chosen) // ACROSS) or 1
+    picture = np.full((rows * TILE_PX, ACROSS * TILE_PX, 3), 255, np.uint8)
+    for i, tile in tiles.items():
+        v, u = divmod(i, ACROSS)
+        picture[v * TILE_PX : (v + 1) * TILE_PX, u * TILE_PX : (u + 1) * TILE_PX] = tile
+    return picture
+
+
+def _tile(image: Image, film: Path, mistake: Mistake) -> Image:
+    """Cut out a mistake, with its box, the film's name, the frame, and the length of the run."""
+    side = max(CUTOUT * mistake.box.larger_side_px, LEAST_CUTOUT_PX)
+    scale = TILE_PX / side
+    # Centres of pixels are whole numbers: the middle of the cutout is half a pixel before its middle column.
+    shift = (TILE_PX - 1) / 2 - scale * mistake.box.center_px
+    tile = cv2.warpAffine(image, np.column_stack([scale * np.eye(2), shift]), (TILE_PX, TILE_PX))
+    colour = MISSED if mistake.kind == "missed" else FALSE
+    draw_box(tile, np.full(2, (TILE_PX - 1) / 2), scale * mistake.box.size_px, colour, "")
+    cv2.putText(tile, film.stem, (4, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.38, colour, 1, cv2.LINE_AA)
+    text = f"{mistake.kind} {mistake.frame}, {mistake.frames} frames"
+    cv2.putText(tile, text, (4, TILE_PX - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.38, colour, 1, cv2.LINE_AA)
+    return np.asarray(tile, dtype=np.uint8)

@@ -1,7 +1,7 @@
 """Write files atomically: a file gets its name only when it is complete, and one run at a time writes it.
 
-`PartFile` locks and replaces a file, and `CsvFile` writes tables. `assets_dir` finds the files that are installed with
-cotarget.
+`PartFile` locks and replaces a file, `CsvFile` writes tables, and `read_table` reads them. `assets_dir` finds the files
+that are installed with cotarget.
 """
 
 import contextlib
@@ -11,9 +11,10 @@ import io
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.safety.signals import DeferredSignals
@@ -253,3 +254,50 @@ def write_all(file: io.RawIOBase, data: bytes) -> None:
     rest = memoryview(data)
     while rest:
         rest = rest[file.write(rest) or 0 :]
+
+
+def read_table(
+    path: Path,
+    columns: Mapping[str, Callable[[str], Any]],
+    what: str,
+    *,
+    names: Sequence[str] | None = None,
+    optional: Mapping[str, Callable[[str], Any]] | None = None,
+) -> list[dict[str, Any]]:
+    """Read columns of a csv.
+
+    Args:
+        path: the file.
+        columns: what reads a column's texts, by the column's name.
+        what: what the file is to be, for messages.
+        names: names of the first columns of a file without a header.
+        optional: columns that may be missing.
+
+    Returns:
+        Values by the column's name, for each row.
+
+    Raises:
+        ConfigError: the file is missing, lacks a column, or holds something else.
+    """
+    rows = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark
+            reader = csv.DictReader(file, names)
+            there = reader.fieldnames or ()
+            if missing := [name for name in columns if name not in there]:
+                raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(columns)}")
+            parsers = {**columns, **{name: read for name, read in (optional or {}).items() if name in there}}
+            for line, row in enumerate(reader, start=2 if names is None else 1):
+                if None in row.values():
+                    raise ValueError(f"line {line} is cut off")
+                for name, read in parsers.items():
+                    try:
+                        row[name] = read(row[name])
+                    except (KeyError, TypeError, ValueError):
+                        raise ValueError(f"line {line} has {row[name]!r} for {name}") from None
+                rows.append({name: row[name] for name in parsers})
+        return rows
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}; give a csv with {', '.join(columns)}") from None
+    except (csv.Error, ValueError) as error:
+        raise ConfigError(f"{path}: is no {what}: {error}") from None

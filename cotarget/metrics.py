@@ -1,25 +1,20 @@
-"""Score runs and tracks: close-ups and wear from the rows of steps.csv, tracks on a film from labels.
+"""Score runs: close-ups and wear from the rows of steps.csv.
 
 A `Row` holds, for one zoom frame, what was commanded and the ground truth. `cotarget.evaluation` makes rows from Steps
 and the simulation's truth. Scores use rows alone, so every figure can be recomputed from a steps.csv.
-
-`score_tracks` compares the table that `cotarget.detect_video.run_on_film` writes with labels: boxes around targets in
-single frames. A frame may have several labels. In frames without labels, only a track that is never on a label counts,
-as false.
 """
 
 import csv
 import dataclasses
 import math
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cotarget.errors import ConfigError
-from cotarget.geometry import Array
+from cotarget.files import read_table
 
 # In frame: least visible part of the silhouette, and least size ratio.
 VISIBLE_IN_FRAME = 0.5
@@ -208,216 +203,11 @@ def read_rows(path: Path) -> list[Row]:
     """
     parse: dict[Any, Callable[[str], Any]] = {int: int, float: float, str: str, bool: _truth_value}
     columns = {f.name: parse[f.type] for f in dataclasses.fields(Row)}
-    return [Row(**row) for row in _read_table(path, columns, "steps.csv")]
+    return [Row(**row) for row in read_table(path, columns, "steps.csv")]
 
 
 def _truth_value(text: str) -> bool:
     return {"True": True, "False": False}[text]
-
-
-def _read_table(path: Path, columns: Mapping[str, Callable[[str], Any]], what: str) -> list[dict[str, Any]]:
-    """Read columns of a csv.
-
-    Args:
-        path: the file.
-        columns: what reads a column's texts, by the column's name.
-        what: what the file is to be, for messages.
-
-    Raises:
-        ConfigError: the file is missing, lacks a column, or holds something else.
-    """
-    rows = []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark
-            reader = csv.DictReader(file)
-            if missing := [name for name in columns if name not in (reader.fieldnames or ())]:
-                raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(columns)}")
-            for line, row in enumerate(reader, start=2):
-                if None in row.values():
-                    raise ValueError(f"line {line} is cut off")
-                for name, read in columns.items():
-                    try:
-                        row[name] = read(row[name])
-                    except (KeyError, TypeError, ValueError):
-                        raise ValueError(f"line {line} has {row[name]!r} for {name}") from None
-                rows.append({name: row[name] for name in columns})
-        return rows
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}; give a csv with {', '.join(columns)}") from None
-    except (csv.Error, ValueError) as error:
-        raise ConfigError(f"{path}: is no {what}: {error}") from None
-
-
-# Tracks on a film, scored by labels
-
-LABELS = ("frame", "x_px", "y_px", "width_px", "height_px")
-# Frames at the start that are not scored, because the background takes a second to be learnt.
-LEARNING_FRAMES = 30
-
-
-@dataclass(frozen=True)
-class Label:
-    """A box around a target: centre (u, v), (2,), and width and height, (2,) [px]."""
-
-    center_px: Array
-    size_px: Array
-
-    @property
-    def larger_side_px(self) -> float:
-        """Larger side of the box [px]."""
-        return float(self.size_px.max())
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """A confirmed track in one frame: frame number and time, track id, and centre (u, v), (2,) [px]."""
-
-    frame: int
-    t: float
-    track: int
-    center_px: Array
-
-
-@dataclass(frozen=True)
-class TrackScore:
-    """Agreement of tracks with labels. A value is None if nothing is labelled or nothing was found.
-
-    A track is on a target if its distance from the label's centre is at most the label's larger side.
-
-    Attributes:
-        labelled_frames: labelled frames that are scored: those after LEARNING_FRAMES, up to the film's last.
-        on_target_ratio: part of these in which a track is on a label.
-        numbers: number of different tracks on a label in these.
-        offset_px_median: median distance of the track from the label's centre [px].
-        fragmentation_per_min: gaps of more than 0.2 s without a track on a label, per minute of labelled frames.
-        false_tracks: tracks that were off every label for 0.5 s without a break in labelled frames, or that lived for
-            0.5 s and were never on one.
-        false_tracks_per_min: false tracks per minute of the film.
-        labels_beyond_end: labelled frames that the film does not have; they are not scored, and may belong to another.
-    """
-
-    labelled_frames: int
-    on_target_ratio: float | None
-    numbers: int
-    offset_px_median: float | None
-    fragmentation_per_min: float | None
-    false_tracks: int
-    false_tracks_per_min: float | None
-    labels_beyond_end: int = 0
-
-
-def score_tracks(
-    tracks: Iterable[Tracked],
-    labels: Mapping[int, Sequence[Label]],
-    rate_hz: float,
-    frames: int,
-    learning_frames: int = LEARNING_FRAMES,
-) -> TrackScore:
-    """Score tracks on a film by labels.
-
-    Args:
-        tracks: confirmed tracks of every frame.
-        labels: labels by frame number, from 0; those of frames beyond the film's end are left out and counted.
-        rate_hz: frames per second.
-        frames: number of frames of the film.
-        learning_frames: frames at the start that are not scored.
-    """
-    offsets: dict[int, dict[int, float]] = {}  # by frame and track, for tracks on a label
-    lives: dict[int, list[Tracked]] = {}
-    for each in tracks:
-        lives.setdefault(each.track, []).append(each)
-        for label in labels.get(each.frame, ()):
-            offset = float(np.linalg.norm(each.center_px - label.center_px))
-            if offset <= label.larger_side_px:
-                on = offsets.setdefault(each.frame, {})
-                on[each.track] = min(offset, on.get(each.track, math.inf))
-    false = sum(_is_false(life, labels, offsets) for life in lives.values())
-    labelled = sorted(frame for frame, boxes in labels.items() if boxes)
-    judged = [frame for frame in labelled if learning_frames <= frame < frames]
-    hits = [offsets[frame] for frame in judged if frame in offsets]
-    minutes, labelled_minutes = frames / rate_hz / 60, len(judged) / rate_hz / 60
-    breaks = _gaps([frame in offsets for frame in judged], judged, rate_hz)
-    return TrackScore(
-        labelled_frames=len(judged),
-        on_target_ratio=len(hits) / len(judged) if judged else None,
-        numbers=len({track for on in hits for track in on}),
-        offset_px_median=float(np.median([min(on.values()) for on in hits])) if hits else None,
-        fragmentation_per_min=breaks / labelled_minutes if hits else None,
-        false_tracks=false,
-        false_tracks_per_min=false / minutes if frames else None,
-        labels_beyond_end=sum(frame >= frames for frame in labelled),
-    )
-
-
-def _is_false(
-    life: Sequence[Tracked], labels: Mapping[int, Sequence[Label]], offsets: Mapping[int, Mapping[int, float]]
-) -> bool:
-    """Whether a track was off every label for half a second without a break; an unlabelled frame is a break."""
-    if not any(each.track in offsets.get(each.frame, ()) for each in life):
-        return life[-1].t - life[0].t >= FALSE_S - ROUNDING_S
-    since: Tracked | None = None
-    last = -1
-    for each in life:
-        if not labels.get(each.frame) or each.track in offsets.get(each.frame, ()):
-            since = None
-        elif since is None or each.frame != last + 1:
-            since = each
-        elif each.t - since.t >= FALSE_S - ROUNDING_S:
-            return True
-        last = each.frame
-    return False
-
-
-def _gaps(on: Sequence[bool], frames: Sequence[int], rate_hz: float) -> int:
-    """Count gaps of more than 0.2 s without a track, within successive labelled frames."""
-    breaks, lacking = 0, 0
-    for i, is_on in enumerate(on):
-        if is_on or (i and frames[i] != frames[i - 1] + 1):
-            lacking = 0
-        if not is_on:
-            lacking += 1
-            # Count a gap once, when it becomes long enough.
-            breaks += lacking / rate_hz > BREAK_S + ROUNDING_S >= (lacking - 1) / rate_hz
-    return breaks
-
-
-def read_labels(path: Path) -> dict[int, list[Label]]:
-    """Read labels from a csv: frame (from 0), x_px, y_px (of the top-left pixel, from 0), width_px and height_px.
-
-    Raises:
-        ConfigError: the file is missing, is no such table, or has no row.
-    """
-    labels: dict[int, list[Label]] = {}
-    for row in _read_table(path, dict.fromkeys(LABELS, _finite), "table of labels"):
-        frame, x, y, width, height = (row[name] for name in LABELS)
-        if not (width > 0 and height > 0 and frame >= 0 and frame == int(frame)):
-            raise ConfigError(f"{path}: a label wants a whole frame from 0 and a width and height above 0, not {row}")
-        size = np.array([width, height])
-        # A box of w pixels from column x covers columns x to x + w - 1.
-        labels.setdefault(int(frame), []).append(Label(np.array([x, y]) + (size - 1) / 2, size))
-    if not labels:
-        raise ConfigError(f"{path}: holds no label, but for the names of its columns; it wants a row for each box")
-    return labels
-
-
-def read_tracks(path: Path) -> list[Tracked]:
-    """Read the table that `cotarget.detect_video.run_on_film` writes.
-
-    Raises:
-        ConfigError: the file is missing, or is no such table.
-    """
-    columns = dict.fromkeys(("frame", "t", "track", "u_px", "v_px"), _finite)
-    return [
-        Tracked(int(row["frame"]), row["t"], int(row["track"]), np.array([row["u_px"], row["v_px"]]))
-        for row in _read_table(path, columns, "table of tracks")
-    ]
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(text)
-    return value
 
 
 # Scores of a run

@@ -2,18 +2,23 @@
 
 import json
 import math
+import re
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from cotarget.cli.main import main
 from cotarget.errors import ConfigError
-from cotarget.metrics import Label, Tracked, read_labels, read_tracks, score_tracks
+from cotarget.track_metrics import Criterion, Label, Tracked, pooled, read_labels, read_tracks, score_tracks
 from cotarget.video import FilmWriter
 from tests.support.recorded_run import RATE_HZ, Bright, calibration_file, record
 
 RATE = 25.0
 FRAMES = 100
+HEAD = "frame,x_px,y_px,width_px,height_px"
+VTEST = Path(__file__).parent / "data" / "vtest.txt"
 
 
 def label(u, v, side=10.0):
@@ -22,7 +27,7 @@ def label(u, v, side=10.0):
 
 def track(number, frames, offset=0.0):
     """On a target that flies a pixel a frame, or beside it."""
-    return [Tracked(i, i / RATE, number, np.array([i + offset, 50.0])) for i in frames]
+    return [Tracked(np.array([i + offset, 50.0]), np.array([10.0, 5.0]), i, i / RATE, number) for i in frames]
 
 
 LABELS = {i: label(i, 50) for i in range(FRAMES)}
@@ -54,15 +59,15 @@ def test_a_track_off_the_target_for_half_a_second_is_false():
 def test_a_track_that_leaves_its_target_for_half_a_second_is_false(away, false):
     """13 frames are 0.48 s from the first to the last, 14 are 0.52."""
     other = [*track(2, range(40, 50)), *track(2, range(50, 50 + away), 30.0), *track(2, range(50 + away, 90))]
-    assert score_tracks([*track(1, range(FRAMES)), *other], LABELS, RATE, FRAMES).false_tracks == false
+    assert score_tracks(other, LABELS, RATE, FRAMES).false_tracks == false
 
 
 def test_frames_without_a_label_do_not_count_against_a_track_that_was_on_target():
     other = [*track(2, range(40, 50)), *track(2, range(50, 90), 30.0)]
     labels = {i: boxes for i, boxes in LABELS.items() if i < 62 or i % 10 == 0}  # 12 frames, and one at a time
-    assert score_tracks([*track(1, range(FRAMES)), *other], labels, RATE, FRAMES).false_tracks == 0
+    assert score_tracks(other, labels, RATE, FRAMES).false_tracks == 0
     never_on = track(3, range(62, 90), 30.0)
-    assert score_tracks([*track(1, range(FRAMES)), *other, *never_on], labels, RATE, FRAMES).false_tracks == 1
+    assert score_tracks([*other, *never_on], labels, RATE, FRAMES).false_tracks == 1
 
 
 @pytest.mark.parametrize(("gap", "breaks"), [(5, 0), (6, 1), (20, 1)])
@@ -95,6 +100,76 @@ def test_labels_beyond_the_end_are_counted_but_not_scored():
     assert score_tracks(track(1, range(FRAMES)), LABELS, RATE, FRAMES).labels_beyond_end == 0
 
 
+def boxes_of(kind, rows, **more):
+    """Labels or tracks of the rows (frame, id, u), 20 px wide and 40 px high."""
+    size = np.array([20.0, 40.0])
+    if kind is Label:
+        labels = {}
+        for frame, target, u in rows:
+            labels.setdefault(frame, []).append(Label(np.array([u, 50.0]), size, target, **more))
+        return labels
+    return [Tracked(np.array([u, 50.0]), size, frame, frame / RATE, number) for frame, number, u in rows]
+
+
+# Two targets: their tracks swap numbers, one is missed once, and once a third track is on nothing.
+TWO = boxes_of(Label, [(0, 1, 100), (0, 2, 200), (1, 1, 100), (1, 2, 200), (2, 1, 100), (2, 2, 200)])
+SWAPPED = boxes_of(Tracked, [(0, 1, 101), (0, 2, 201), (1, 2, 101), (1, 3, 300), (2, 2, 101), (2, 1, 201)])
+
+
+def test_three_frames_by_hand():
+    score = score_tracks(SWAPPED, TWO, RATE, 3, 0)
+    assert (score.boxes, score.found, score.false_boxes, score.id_switches) == (6, 5, 1, 2)
+    assert (score.recall, score.precision) == (5 / 6, 5 / 6)
+    assert score.mota == pytest.approx(1 - (1 + 1 + 2) / 6)
+    # Track 2 is on target 1 in two frames, and track 1 on target 2 in one.
+    assert (score.id_found, score.idf1) == (3, 2 * 3 / (6 + 6))
+    assert [(each.boxes, each.recall, each.numbers) for each in score.targets.values()] == [(3, 1.0, 2), (3, 2 / 3, 2)]
+    assert score.sizes["medium"] == {"boxes": 6, "found": 5, "recall": 5 / 6}
+
+
+@pytest.mark.parametrize(("off", "iou", "small_px", "found"), [
+    (9, 0.3, 0, 1),  # intersection 11 of 20 columns, over 29: 0.38
+    (11, 0.3, 0, 0),  # 9 / 31 = 0.29
+    (39, 0.3, 40, 1),  # the centre is within the larger side
+    (41, 0.3, 40, 0),
+    (39, 0.3, 39, 0),
+])  # fmt: skip
+def test_small_boxes_are_matched_by_distance_and_others_by_overlap(off, iou, small_px, found):
+    labels, tracks = boxes_of(Label, [(0, 1, 100)]), boxes_of(Tracked, [(0, 1, 100 + off)])
+    assert score_tracks(tracks, labels, RATE, 1, 0, Criterion(iou, small_px)).found == found
+
+
+def test_a_pair_stays_while_it_is_near_enough():
+    labels = boxes_of(Label, [(0, 1, 100), (1, 1, 100)])
+    tracks = boxes_of(Tracked, [(0, 1, 100), (1, 1, 105), (1, 2, 100)])
+    assert score_tracks(tracks, labels, RATE, 2, 0).id_switches == 0
+
+
+def test_one_track_finds_one_of_two_labels():
+    labels = boxes_of(Label, [(0, 1, 100), (0, 2, 104)])
+    assert score_tracks(boxes_of(Tracked, [(0, 1, 102)]), labels, RATE, 1, 0).recall == 0.5
+
+
+def test_a_track_on_a_label_that_does_not_count_is_neither_right_nor_wrong():
+    labels = boxes_of(Label, [(0, 1, 100)], counts=False)
+    score = score_tracks(boxes_of(Tracked, [(0, 1, 100), (0, 2, 200)]), labels, RATE, 1, 0)
+    assert (score.boxes, score.found, score.false_boxes) == (0, 0, 1)
+
+
+def test_the_first_track_is_timed_from_the_first_label():
+    labels, tracks = boxes_of(Label, [(i, 1, 100) for i in range(9)]), boxes_of(Tracked, [(i, 1, 100) for i in (5, 6)])
+    assert score_tracks(tracks, labels, RATE, 9, 0).targets[1].first_track_s == pytest.approx(5 / RATE)
+
+
+def test_films_are_pooled_by_boxes():
+    one, two = (score_tracks(SWAPPED, TWO, RATE, 3, 0), score_tracks([], boxes_of(Label, [(0, 1, 9)]), RATE, 3, 0))
+    found = pooled([one, two], 2.0)
+    assert (found["films"], found["boxes"], found["recall"], found["precision"]) == (2, 7, 5 / 7, 5 / 6)
+    assert (found["recall_median"], found["recall_least"]) == (pytest.approx(5 / 12), 0.0)
+    assert found["sizes"]["medium"]["boxes"] == 7
+    assert found["numbers_median"] == 2
+
+
 def write_labels(path, rows, head="frame,x_px,y_px,width_px,height_px"):
     path.write_text("\n".join([head, *rows]) + "\n")
     return path
@@ -105,13 +180,30 @@ def test_labels_are_boxes_by_their_first_pixel(tmp_path):
     assert [each.center_px.tolist() for each in found[3]] == [[12.0, 20.5], [0.0, 0.0]]
 
 
+def test_targets_of_a_csv_are_numbered_by_a_column_or_by_their_order(tmp_path):
+    rows = ["3,10,20,5,2", "3,0,0,1,1", "4,0,0,1,1"]
+    numbered = [f"{row},{7 + i}" for i, row in enumerate(rows)]
+    for given, expected in ((write_labels(tmp_path / "a.csv", rows), [1, 2, 1]),
+                            (write_labels(tmp_path / "b.csv", numbered, f"{HEAD},target"), [7, 8, 9])):  # fmt: skip
+        assert [each.target for boxes in read_labels(given).values() for each in boxes] == expected
+
+
+def test_ground_truth_of_the_mot_challenge_counts_from_one(tmp_path):
+    found = read_labels(write_labels(tmp_path / "gt.txt", ["2,4,13,5,2,1,1,0.4", "2,5,1,1,3,3,0,1,0"], "2,9,1,1,1,1,1"))
+    assert list(found) == [1]
+    assert [(each.target, each.counts, each.center_px.tolist()) for each in found[1]] == [
+        (9, True, [0.0, 0.0]),
+        (4, True, [12.5, 4.0]),
+        (5, False, [1.0, 1.0]),
+    ]
+    boxes = [each for labels in read_labels(VTEST).values() for each in labels]
+    assert (len(boxes), sum(each.counts for each in boxes)) == (382, 356)
+
+
 def test_labels_may_begin_with_a_byte_order_mark(tmp_path):
     path = write_labels(tmp_path / "labels.csv", ["3,10,20,5,2"])
     path.write_text(path.read_text(), encoding="utf-8-sig")
     assert list(read_labels(path)) == [3]
-
-
-HEAD = "frame,x_px,y_px,width_px,height_px"
 
 
 @pytest.mark.parametrize(("rows", "head", "named"), [
@@ -135,24 +227,73 @@ def test_an_unreadable_table_is_named(tmp_path):
             read_labels(path)
 
 
-def test_the_command_scores_a_film(tmp_path, capsys):
-    """A dark square that flies over a grey wall, labelled where it is."""
+def write_film(path, step=3):
+    """A dark square that flies over a grey wall; its label in every frame."""
     rng, rows = np.random.default_rng(0), []
-    with FilmWriter(tmp_path / "film.mp4", RATE) as film:
+    with FilmWriter(path, RATE) as film:
         for i in range(80):
             image = np.full((120, 320, 3), 170, np.uint8) + rng.integers(-3, 4, (120, 320, 3)).astype(np.uint8)
-            x = 20 + 3 * i
+            x = 20 + step * i
             image[50:60, x : x + 10] = 20
             film.write(image, i / RATE)
             rows.append(f"{i},{x},50,10,10")
-    labels = write_labels(tmp_path / "labels.csv", rows)
+    return rows
+
+
+def test_the_command_scores_a_film(tmp_path, capsys):
+    labels = write_labels(tmp_path / "labels.csv", write_film(tmp_path / "film.mp4"))
     arguments = ["detect", str(tmp_path / "film.mp4"), "--target", "bird", "--csv", str(tmp_path / "tracks.csv")]
     assert main([*arguments, "--labels", str(labels)]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["labelled_frames"], found["on_target_ratio"], found["numbers"]) == (50, 1.0, 1)
+    assert (found["recall"], found["precision"], found["mota"], found["idf1"]) == (1.0, 1.0, 1.0, 1.0)
     assert found["false_tracks"] == 0
     assert found["offset_px_median"] < 1.5
     assert len(read_tracks(tmp_path / "tracks.csv")) >= 50
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two films; the second one's labels are where nothing is."""
+    (tmp_path / "tables").mkdir()
+    for name, column in (("one", 0), ("two", 9)):
+        (tmp_path / "films").mkdir(exist_ok=True)
+        rows = write_film(tmp_path / "films" / f"{name}.mp4")
+        rows = [",".join([*row.split(",")[:2], "100", "10", "10"]) for row in rows] if column else rows
+        write_labels(tmp_path / "films" / f"{name}.csv", rows)
+    return tmp_path
+
+
+def detect_folder(folder, *more, labels="films"):
+    given = ["--csv", str(folder / "tables"), "--labels", str(folder / labels)]
+    return main(["detect", str(folder / "films"), "--target", "bird", *given, *more])
+
+
+def test_the_command_scores_a_folder_of_films(folder, capsys):
+    assert detect_folder(folder, "--sheet", str(folder / "sheet.png")) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {name: each["recall"] for name, each in found["films"].items()} == {"one": 1.0, "two": 0.0}
+    assert (found["pooled"]["films"], found["pooled"]["boxes"], found["pooled"]["recall"]) == (2, 100, 0.5)
+    assert found["pooled"]["false_tracks_per_min"] == pytest.approx(60 * RATE / 160)
+    assert sorted(path.name for path in (folder / "tables").iterdir()) == ["one.csv", "two.csv"]
+    # A green miss and a red false track, with the square in the middle of the second.
+    sheet = cv2.imread(str(folder / "sheet.png"))
+    assert sheet.shape == (200, 1200, 3)
+    assert sheet[100, 300].max() < 60
+    assert sheet[100, 100].min() > 140
+
+
+@pytest.mark.parametrize(("labels", "more", "named"), [
+    ("tables", (), "one.mp4: has no labels; give"),
+    ("films/one.csv", (), "--labels: .* is a folder"),
+    ("films", ("--video", "drawn.mp4"), "--video: draws the tracks of one video"),
+    ("films", ("--csv", "none"), "--csv: .* existing folder"),
+])  # fmt: skip
+def test_a_folder_that_cannot_be_scored_is_refused(folder, capsys, labels, more, named):
+    assert detect_folder(folder, *more, labels=labels) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert re.fullmatch(rf"cotarget detect: .*{named}.*\n", err)
 
 
 def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):

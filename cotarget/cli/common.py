@@ -20,9 +20,9 @@ from cotarget.files import STDOUT, behind_link, write_atomically
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig
-    from cotarget.metrics import Label, Tracked
     from cotarget.parallel import Progress
     from cotarget.rig import Rig, RigSpec
+    from cotarget.track_metrics import Criterion, Label, Tracked
 
 
 @contextmanager
@@ -143,16 +143,17 @@ def scores_of(
     frames: int,
     *,
     whole: bool = True,
+    criterion: "Criterion | None" = None,
 ) -> dict[str, Any]:
     """Score tracks against the labels of a file, by frame; empty without labels.
 
     ``whole`` is false for a film that ends too early, whose last labels are then no sign of another film's.
     """
-    from cotarget.metrics import score_tracks
+    from cotarget.track_metrics import Criterion, score_tracks
 
     if labels is None:
         return {}
-    score = score_tracks(tracks, labels, rate_hz, frames)
+    score = score_tracks(tracks, labels, rate_hz, frames, criterion=criterion or Criterion())
     if score.labels_beyond_end:
         print(
             f"{file}: {score.labels_beyond_end} of {len(labels)} labelled frames are beyond the last one, "
@@ -283,6 +284,22 @@ def positive(text: str) -> float:
 def duration(text: str) -> float:
     """Parse a number of seconds greater than zero; inf for no end."""
     return math.inf if text == "inf" else positive(text)
+
+
+def share(text: str) -> float:
+    """Parse a number above zero, up to one."""
+    value = positive(text)
+    if value > 1:
+        raise argparse.ArgumentTypeError(f"{text} is greater than one")
+    return value
+
+
+def length(text: str) -> float:
+    """Parse a number of at least zero; inf for any length."""
+    value = math.inf if text == "inf" else number(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is less than zero")
+    return value
 
 
 def whole(lowest: int, highest: float = math.inf) -> Callable[[str], int]:

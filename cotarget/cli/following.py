@@ -34,10 +34,10 @@ from cotarget.files import STDOUT, CsvFile
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig, TargetProfile
-    from cotarget.metrics import Tracked
     from cotarget.pipeline import Step
     from cotarget.recording.replay import Replay
     from cotarget.rig import Rig
+    from cotarget.track_metrics import Tracked
 
 
 def follow_command(options: argparse.Namespace) -> int:
@@ -87,9 +87,9 @@ def replay_command(options: argparse.Namespace) -> int:
     """Run `cotarget replay`: run the pipeline on a recording and compare its commands; return the exit status."""
     from cotarget.backends import open_recording
     from cotarget.calibration import load_calibration
-    from cotarget.metrics import read_labels
     from cotarget.recording.replay import Replay
     from cotarget.safety.safe_rig import guard
+    from cotarget.track_metrics import read_labels
 
     recording = open_recording(options.recording)
     for note in recording.notes:
@@ -374,10 +374,14 @@ class TracksByImage:
 
     def see(self, step: "Step") -> None:
         """Collect the tracks of a step."""
-        from cotarget.metrics import Tracked
+        from cotarget.track_metrics import Tracked
 
         frame = self._numbers[step.fixed.t]
-        self.tracks += [Tracked(frame, step.fixed.t, each.id, each.center_px) for each in step.tracks if each.confirmed]
+        self.tracks += [
+            Tracked(each.center_px, each.size_px, frame, step.fixed.t, each.id)
+            for each in step.tracks
+            if each.confirmed
+        ]
 
 
 # Reasons of the steps

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cotarget.cli import calibrating, following, operating, running
-from cotarget.cli.common import board_corners, duration, number, port, positive, whole
+from cotarget.cli.common import board_corners, duration, length, number, port, positive, share, whole
 from cotarget.cli.following import add_selection
 from cotarget.errors import CotargetError
 
@@ -306,21 +306,26 @@ def _add_inspection(command: Command) -> None:
     view.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")
 
     detect = command("detect", running.detect_command, "run the fixed camera's detector and tracker on any video")
-    _add_file(detect, "film", "video to search", "VIDEO")
+    _add_file(detect, "film", "video to search, or a folder of videos", "VIDEO")
     about = "a target of rig.toml, or one of book, person, bird"
     detect.add_argument("--target", required=True, metavar="NAME", help=about)
     about = (
         "write one line per confirmed track and frame, to stdout with -: u_px and v_px are the box's centre, the score "
-        "is 0 where the box is only predicted"
+        "is 0 where the box is only predicted; for a folder of videos, the folder for their tables"
     )
     _add_file(detect, "--csv", about, required=True)
     _add_file(detect, "--video", "write the video with the tracks drawn (.mp4)", "OUT")
     _add_file(detect, "--rig", "rig.toml, for targets of your own")
     about = (
         "score the tracks by these boxes: a csv with frame,x_px,y_px,width_px,height_px, all from 0; x and y are of "
-        "the box's top-left pixel"
+        "the box's top-left pixel; or ground truth of the MOT-challenge; for a folder of videos, a folder"
     )
     _add_file(detect, "--labels", about)
+    _add_file(detect, "--sheet", "write a picture of the longest misses and false tracks in a folder of videos", "PNG")
+    about = "least intersection over union of a track on a label (0.3)"
+    detect.add_argument("--iou", type=share, default=0.3, metavar="R", help=about)
+    about = "judge boxes up to this side by the distance of their centres, at most the label's larger side (24)"
+    detect.add_argument("--small-px", type=length, default=24.0, metavar="N", help=about)
 
     board = command("board", calibrating.board_command, "write a calibration board to print, to scale")
     _add_file(board, "--out", "file to write: .pdf, .svg or .png", required=True)

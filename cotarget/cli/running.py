@@ -17,11 +17,12 @@ from cotarget.files import STDOUT
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
-    from cotarget.config import RigConfig
+    from cotarget.config import RigConfig, TargetProfile
     from cotarget.rig import Rig
     from cotarget.sim.truth import Truth
     from cotarget.sim.viewer.scene import Snapshot
     from cotarget.sim.world import SimWorld
+    from cotarget.track_metrics import Criterion
 
 
 PORT = 8080  # port of the page
@@ -164,15 +165,21 @@ def demo_command(options: argparse.Namespace) -> None:
 
 
 def detect_command(options: argparse.Namespace) -> None:
-    """Run `cotarget detect`: run the fixed camera's detector and tracker on a video."""
+    """Run `cotarget detect`: run the fixed camera's detector and tracker on a video, or on a folder of videos."""
     from cotarget.backends import load_config
     from cotarget.config import RigConfig
     from cotarget.detect_video import run_on_film
-    from cotarget.metrics import read_labels, read_tracks
+    from cotarget.track_metrics import Criterion, read_labels, read_tracks
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
     with naming("--target"):
         target = config.target(options.target)
+    criterion = Criterion(options.iou, options.small_px)
+    if options.film.is_dir():
+        _detect_in_folder(options, target, criterion)
+        return
+    if options.sheet is not None:
+        raise ConfigError(f"--sheet: shows the mistakes in a folder of videos, and {options.film} is none")
     if options.csv == STDOUT and options.labels is not None:
         raise ConfigError("--labels: scores the table of --csv; name its file, not -")
     table = None if options.csv == STDOUT else options.csv
@@ -187,10 +194,28 @@ def detect_command(options: argparse.Namespace) -> None:
             "labels of this film, with frames from 0"
         )
     tracks = [] if labels is None else read_tracks(options.csv)
-    scores = scores_of(options.labels, tracks, labels, found.rate_hz, found.last_frame + 1, whole=whole)
+    frames = found.last_frame + 1
+    scores = scores_of(options.labels, tracks, labels, found.rate_hz, frames, whole=whole, criterion=criterion)
     print_json(dataclasses.asdict(found) | scores, options.csv)
     if not whole:
         print(f"{options.film}: is not whole: {found.shortfall}; the results are of what there is", file=sys.stderr)
+
+
+def _detect_in_folder(options: argparse.Namespace, target: "TargetProfile", criterion: "Criterion") -> None:
+    """Score the videos of a folder by the labels of another."""
+    from cotarget.detect_video import labelled_films, run_on_folder
+
+    if options.labels is None or not options.labels.is_dir():
+        raise ConfigError(f"--labels: {options.film} is a folder; give the folder with a file of labels for each video")
+    if options.video is not None:
+        raise ConfigError("--video: draws the tracks of one video, not of a folder")
+    films = labelled_films(options.film, options.labels)
+    if options.csv == STDOUT or not options.csv.is_dir():
+        raise ConfigError(f"--csv: {options.film} is a folder; give an existing folder for the tables")
+    tables = [options.csv / f"{film.stem}.csv" for film, _ in films]
+    check_outputs([*tables, options.sheet], [path for pair in films for path in pair])
+    with progress_bar() as progress:
+        print_json(run_on_folder(films, target, options.csv, options.sheet, criterion, progress))
 
 
 def doctor_command(options: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detect_video import run_on_film
-from cotarget.metrics import Label, read_labels, read_tracks, score_tracks
+from cotarget.track_metrics import Label, read_labels, read_tracks, score_tracks
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 LEAST_COVERAGE = 0.95

@@ -1,0 +1,504 @@
+"""Score tracks on a film by labelled boxes: recall, precision, false tracks, MOTA, IDF1, per target and per size.
+
+In each labelled frame, tracks and labels are matched one to one, as the CLEAR MOT metrics have it (Bernardin and
+Stiefelhagen 2008): the pairs of the frame before stay as long as they are near enough, the others are assigned by
+similarity. IDF1 is that of Ristani et al. (2016). Frames without labels say nothing, except of a track that is never on
+a label.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from cotarget.errors import ConfigError
+from cotarget.files import read_table
+from cotarget.geometry import Array
+from cotarget.metrics import BREAK_S, ROUNDING_S, false_tracks
+
+LABELS = ("frame", "x_px", "y_px", "width_px", "height_px")
+MOT_COLUMNS = ("frame", "id", "left", "top", "width", "height", "counts")
+# Frames at the start that are not scored, because the background takes a second to be learnt.
+LEARNING_FRAMES = 30
+# Classes of size, by the larger side of a label's box: up to the first, up to the second, and above [px].
+SIZES_PX = (24.0, 60.0)
+SIZE_NAMES = ("small", "medium", "large")
+# Bonus of a pair of the frame before, above any similarity.
+KEPT = 1000.0
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box in an image: centre (u, v), (2,), and width and height, (2,) [px]."""
+
+    center_px: Array
+    size_px: Array
+
+    @property
+    def larger_side_px(self) -> float:
+        """Larger side of the box [px]."""
+        return float(self.size_px.max())
+
+
+@dataclass(frozen=True)
+class Label(Box):
+    """A labelled box.
+
+    Attributes:
+        target: id of the target.
+        counts: whether it is scored; a track on a label that does not count is neither right nor wrong.
+    """
+
+    target: int = 1
+    counts: bool = True
+
+
+@dataclass(frozen=True)
+class Tracked(Box):
+    """A confirmed track in one frame: its box, frame number, time [s], and track id."""
+
+    frame: int
+    t: float
+    track: int
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """When a track's box is on a label's box.
+
+    Attributes:
+        iou: least intersection over union.
+        small_px: if the larger side of either box is at most this, the distance of the centres decides instead: it may
+            be as much as the label's larger side. Labelled boxes of specks are several times as large as the speck, so
+            that overlap says little. 0 for overlap alone, inf for distance alone.
+    """
+
+    iou: float = 0.3
+    small_px: float = 24.0
+
+    def similarity(self, labels: Sequence[Box], tracks: Sequence[Box]) -> Array:
+        """Compare every label with every track: at least `iou` where the track is on the label, (labels, tracks)."""
+        if not labels or not tracks:
+            return np.zeros((len(labels), len(tracks)))
+        at, size = (np.array([getattr(each, name) for each in labels])[:, None] for name in ("center_px", "size_px"))
+        center, extent = (np.array([getattr(each, name) for each in tracks]) for name in ("center_px", "size_px"))
+        overlap = np.minimum(at + size / 2, center + extent / 2) - np.maximum(at - size / 2, center - extent / 2)
+        shared = np.maximum(overlap, 0.0).prod(axis=-1)
+        iou = shared / (size.prod(axis=-1) + extent.prod(axis=-1) - shared)
+        side = size.max(axis=-1)
+        near = 1 - (1 - self.iou) * np.linalg.norm(at - center, axis=-1) / side  # `iou` at a distance of one side
+        return np.where(np.minimum(side, extent.max(axis=-1)) <= self.small_px, near, iou)
+
+
+@dataclass(frozen=True)
+class TargetScore:
+    """Score of one target. A value is None if the target was never found.
+
+    Attributes:
+        boxes: labelled boxes that are scored.
+        recall: part of these with a track on it.
+        numbers: number of different tracks on it.
+        first_track_s: time from its first labelled frame to the first track on it [s].
+    """
+
+    boxes: int
+    recall: float
+    numbers: int
+    first_track_s: float | None
+
+
+@dataclass(frozen=True)
+class TrackScore:
+    """Agreement of tracks with labels. A value is None if nothing is labelled or nothing was found.
+
+    Recall, precision, MOTA, IDF1 and identity switches are over the labelled frames after LEARNING_FRAMES, up to the
+    film's last.
+
+    Attributes:
+        labelled_frames: number of these frames.
+        on_target_ratio: part of these in which a track is on a label.
+        numbers: number of different tracks on a label in these.
+        offset_px_median: median distance of a track from its label's centre [px].
+        fragmentation_per_min: gaps of more than 0.2 s without a track on a label, per minute of labelled frames.
+        false_tracks: tracks that were off every label for 0.5 s without a break in labelled frames, or that lived for
+            0.5 s and were never on one.
+        false_tracks_per_min: false tracks per minute of the film.
+        labels_beyond_end: labelled frames that the film does not have; they are not scored, and may belong to another.
+        boxes: labelled boxes.
+        found: labelled boxes with a track on it.
+        false_boxes: boxes of tracks that are on no label.
+        id_found: boxes found with the best one-to-one assignment of track numbers to targets.
+        id_switches: how often another track is on a target than the one before.
+        recall: `found` over `boxes`.
+        precision: `found` over `found` and `false_boxes`.
+        mota: multiple object tracking accuracy, 1 - (missed + false boxes + switches) / boxes.
+        idf1: F1 score of `id_found`.
+        sizes: boxes and recall by the larger side of the label: "small" up to 24 px, "medium" up to 60, "large" above.
+        targets: score of each target, by id.
+    """
+
+    labelled_frames: int
+    on_target_ratio: float | None
+    numbers: int
+    offset_px_median: float | None
+    fragmentation_per_min: float | None
+    false_tracks: int
+    false_tracks_per_min: float | None
+    labels_beyond_end: int
+    boxes: int
+    found: int
+    false_boxes: int
+    id_found: int
+    id_switches: int
+    recall: float | None
+    precision: float | None
+    mota: float | None
+    idf1: float | None
+    sizes: dict[str, dict[str, float | None]]
+    targets: dict[int, TargetScore]
+
+
+@dataclass(frozen=True)
+class FrameMatch:
+    """Match of one labelled frame.
+
+    Attributes:
+        frame: number of the frame.
+        pairs: label and track of each match.
+        missed: labels that count and have no track.
+        false: tracks that are on no label.
+        near: pairs of target and track that are near enough, one-to-one or not, for IDF1.
+    """
+
+    frame: int
+    pairs: list[tuple[Label, Tracked]]
+    missed: list[Label]
+    false: list[Tracked]
+    near: list[tuple[int, int]]
+
+
+def match_frames(
+    tracks: Iterable[Tracked], labels: Mapping[int, Sequence[Label]], criterion: Criterion = Criterion()
+) -> list[FrameMatch]:
+    """Match tracks and labels one to one in every labelled frame, in the order of frames."""
+    by_frame: dict[int, list[Tracked]] = {}
+    for each in tracks:
+        by_frame.setdefault(each.frame, []).append(each)
+    matches, before = [], dict[int, int]()
+    for frame in sorted(labels):
+        counted = [label for label in labels[frame] if label.counts]
+        ignored = [label for label in labels[frame] if not label.counts]
+        found = by_frame.get(frame, [])
+        similar = criterion.similarity(counted, found)
+        enough = similar >= criterion.iou - np.finfo(float).eps
+        kept = np.array([[before.get(label.target) == each.track for each in found] for label in counted])
+        value = np.where(enough, similar + KEPT * kept.reshape(similar.shape), 0.0)
+        rows, columns = linear_sum_assignment(-value)
+        pairs = [(counted[i], found[j]) for i, j in zip(rows, columns, strict=True) if enough[i, j]]
+        before = {label.target: each.track for label, each in pairs}
+        right, ids = {each.track for _, each in pairs}, {label.target for label, _ in pairs}
+        excused: list[bool] = np.any(criterion.similarity(ignored, found) >= criterion.iou, axis=0).tolist()
+        wrong = [each for each, excuse in zip(found, excused, strict=True) if each.track not in right and not excuse]
+        near = [(counted[i].target, found[j].track) for i, j in np.argwhere(enough)]
+        missed = [label for label in counted if label.target not in ids]
+        matches.append(FrameMatch(frame, pairs, missed, wrong, near))
+    return matches
+
+
+def score_tracks(
+    tracks: Iterable[Tracked],
+    labels: Mapping[int, Sequence[Label]],
+    rate_hz: float,
+    frames: int,
+    learning_frames: int = LEARNING_FRAMES,
+    criterion: Criterion = Criterion(),
+) -> TrackScore:
+    """Score tracks on a film by labels.
+
+    Args:
+        tracks: confirmed tracks of every frame.
+        labels: labels by frame number, from 0; those of frames beyond the film's end are left out and counted.
+        rate_hz: frames per second.
+        frames: number of frames of the film.
+        learning_frames: frames at the start that are not scored.
+        criterion: when a track is on a label.
+    """
+    tracks = list(tracks)
+    labelled = {frame: boxes for frame, boxes in labels.items() if boxes}
+    matches = match_frames(tracks, {k: boxes for k, boxes in labelled.items() if k < frames}, criterion)
+    scored = [each for each in matches if each.frame >= learning_frames]
+    pairs = [pair for each in scored for pair in each.pairs]
+    seconds = len(scored) / rate_hz
+    boxes = len(pairs) + sum(len(each.missed) for each in scored)
+    false_boxes = sum(len(each.false) for each in scored)
+    switches, id_found = _id_switches(scored), _id_found(scored)
+    false = _false_tracks(tracks, matches)
+    return TrackScore(
+        labelled_frames=len(scored),
+        on_target_ratio=_ratio(sum(bool(each.pairs) for each in scored), len(scored)),
+        numbers=len({track.track for _, track in pairs}),
+        offset_px_median=float(np.median([_distance(*pair) for pair in pairs])) if pairs else None,
+        fragmentation_per_min=60 * _gaps(scored, rate_hz) / seconds if pairs else None,
+        false_tracks=false,
+        false_tracks_per_min=60 * false * rate_hz / frames if frames else None,
+        labels_beyond_end=sum(frame >= frames for frame in labelled),
+        boxes=boxes,
+        found=len(pairs),
+        false_boxes=false_boxes,
+        id_found=id_found,
+        id_switches=switches,
+        sizes=_sizes(scored),
+        targets=_targets(scored, rate_hz),
+        **_ratios(boxes, len(pairs), false_boxes, switches, id_found),
+    )
+
+
+def _ratios(boxes: int, found: int, false_boxes: int, switches: int, id_found: int) -> dict[str, float | None]:
+    return {
+        "recall": _ratio(found, boxes),
+        "precision": _ratio(found, found + false_boxes),
+        "mota": _ratio(found - false_boxes - switches, boxes),
+        "idf1": _ratio(2 * id_found, boxes + found + false_boxes),
+    }
+
+
+def _ratio(part: float, whole: float) -> float | None:
+    return part / whole if whole else None
+
+
+def _distance(label: Label, track: Tracked) -> float:
+    return float(np.linalg.norm(label.center_px - track.center_px))
+
+
+def _id_switches(matches: Sequence[FrameMatch]) -> int:
+    """Count how often a target's track differs from the last one that was on it."""
+    switches, last = 0, dict[int, int]()
+    for match in matches:
+        for label, track in match.pairs:
+            switches += last.get(label.target, track.track) != track.track
+            last[label.target] = track.track
+    return switches
+
+
+def _id_found(matches: Sequence[FrameMatch]) -> int:
+    """Count the boxes found with the one-to-one assignment of track numbers to targets that finds most."""
+    together = Counter(pair for match in matches for pair in match.near)
+    targets, numbers = sorted({target for target, _ in together}), sorted({number for _, number in together})
+    counts = np.zeros((len(targets), len(numbers)), dtype=int)
+    for (target, number), count in together.items():
+        counts[targets.index(target), numbers.index(number)] = count
+    return int(counts[linear_sum_assignment(-counts)].sum())
+
+
+def _false_tracks(tracks: Sequence[Tracked], matches: Sequence[FrameMatch]) -> int:
+    """Count tracks that were off every label for half a second; frames without labels are a break for those once on."""
+    on = {track.track for match in matches for _, track in match.pairs}
+    off = {match.frame: {track.track for track in match.false} for match in matches}
+    by_frame: dict[int, list[Tracked]] = {}
+    for each in tracks:
+        by_frame.setdefault(each.frame, []).append(each)
+    never_on = (
+        (found[0].t, off.get(frame, {each.track for each in found if each.track not in on}))
+        for frame, found in sorted(by_frame.items())
+    )
+    return false_tracks(never_on)
+
+
+def _gaps(matches: Sequence[FrameMatch], rate_hz: float) -> int:
+    """Count gaps of more than 0.2 s without a track on a label, within successive labelled frames."""
+    breaks, lacking, last = 0, 0, -1
+    for match in matches:
+        if match.pairs or match.frame != last + 1:
+            lacking = 0
+        if not match.pairs:
+            lacking += 1
+            # Count a gap once, when it becomes long enough.
+            breaks += lacking / rate_hz > BREAK_S + ROUNDING_S >= (lacking - 1) / rate_hz
+        last = match.frame
+    return breaks
+
+
+def _sizes(matches: Sequence[FrameMatch]) -> dict[str, dict[str, float | None]]:
+    found, all_boxes = Counter[str](), Counter[str]()
+    for match in matches:
+        hit = [_size_name(label) for label, _ in match.pairs]
+        found.update(hit)
+        all_boxes.update(hit + [_size_name(label) for label in match.missed])
+    return {
+        name: {"boxes": all_boxes[name], "found": found[name], "recall": _ratio(found[name], all_boxes[name])}
+        for name in SIZE_NAMES
+    }
+
+
+def _size_name(label: Label) -> str:
+    return SIZE_NAMES[int(np.searchsorted(SIZES_PX, label.larger_side_px))]
+
+
+def _targets(matches: Sequence[FrameMatch], rate_hz: float) -> dict[int, TargetScore]:
+    frames: dict[int, list[tuple[int, int | None]]] = {}  # frame and track of each target
+    for match in matches:
+        for label, track in match.pairs:
+            frames.setdefault(label.target, []).append((match.frame, track.track))
+        for label in match.missed:
+            frames.setdefault(label.target, []).append((match.frame, None))
+    scores = {}
+    for target, seen in sorted(frames.items()):
+        found = [(frame, track) for frame, track in seen if track is not None]
+        first = (found[0][0] - seen[0][0]) / rate_hz if found else None
+        scores[target] = TargetScore(len(seen), len(found) / len(seen), len({track for _, track in found}), first)
+    return scores
+
+
+def pooled(scores: Sequence[TrackScore], minutes: float) -> dict[str, object]:
+    """Pool the scores of several films: every box counts the same.
+
+    Args:
+        scores: score of each film.
+        minutes: duration of all films together [min].
+
+    Returns:
+        `boxes`, `recall`, `precision`, `mota`, `idf1`, `id_switches`, `false_tracks`, `false_tracks_per_min`, `sizes`;
+        and over the targets of all films the median of `numbers` and of `first_track_s`, and the median and the least
+        `recall` over the films.
+    """
+    boxes, found, false_boxes, switches, id_found, false = (
+        sum(getattr(each, name) for each in scores)
+        for name in ("boxes", "found", "false_boxes", "id_switches", "id_found", "false_tracks")
+    )
+    sizes = {}
+    for name in SIZE_NAMES:
+        hit, of = (int(sum(each.sizes[name][key] or 0 for each in scores)) for key in ("found", "boxes"))
+        sizes[name] = {"boxes": of, "found": hit, "recall": _ratio(hit, of)}
+    targets = [target for each in scores for target in each.targets.values()]
+    recalls = [each.recall for each in scores if each.recall is not None]
+    return {
+        "films": len(scores),
+        "boxes": boxes,
+        **_ratios(boxes, found, false_boxes, switches, id_found),
+        "id_switches": switches,
+        "false_tracks": false,
+        "false_tracks_per_min": _ratio(false, minutes),
+        "sizes": sizes,
+        "numbers_median": _median([each.numbers for each in targets if each.numbers]),
+        "first_track_s_median": _median([each.first_track_s for each in targets if each.first_track_s is not None]),
+        "recall_median": _median(recalls),
+        "recall_least": min(recalls, default=None),
+    }
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A run of frames in which a target was missed, or a track was on no label.
+
+    Attributes:
+        kind: "missed" or "false".
+        frame: number of the frame in the middle of the run.
+        box: label or track in that frame.
+        frames: length of the run.
+    """
+
+    kind: str
+    frame: int
+    box: Box
+    frames: int
+
+
+def mistakes(matches: Sequence[FrameMatch]) -> list[Mistake]:
+    """Find the longest run of misses of each target, and of wrong boxes of each track; the longest first."""
+    runs: dict[tuple[str, int], list[list[tuple[int, Box]]]] = {}
+    last: dict[tuple[str, int], int] = {}
+    for i, match in enumerate(matches):
+        wrong: list[tuple[str, int, Box]] = [("missed", label.target, label) for label in match.missed]
+        wrong += [("false", track.track, track) for track in match.false]
+        for kind, number, box in wrong:
+            key = kind, number
+            if last.get(key) != i - 1:
+                runs.setdefault(key, []).append([])
+            runs[key][-1].append((match.frame, box))
+            last[key] = i
+    found = []
+    for (kind, _), of in runs.items():
+        longest = max(of, key=len)
+        found.append(Mistake(kind, *longest[len(longest) // 2], len(longest)))
+    return sorted(found, key=lambda each: -each.frames)
+
+
+# Files
+
+
+def read_labels(path: Path) -> dict[int, list[Label]]:
+    """Read labels by frame number, from 0: a csv, or ground truth of the MOT-challenge.
+
+    The csv has the columns of `LABELS`, all from 0, of the box's top-left pixel; with a column `target`, that is the
+    target's id, and otherwise the first box of every frame belongs to target 1, and so on. A file of the MOT-challenge
+    has no header; its frames and pixels count from 1, and boxes marked with 0 do not count.
+
+    Raises:
+        ConfigError: the file is missing, is no such table, or has no row.
+    """
+    labels: dict[int, list[Label]] = {}
+    for frame, target, x, y, width, height, counts in _label_rows(path):
+        if not (width > 0 and height > 0 and frame >= 0 and frame == int(frame)):
+            raise ConfigError(
+                f"{path}: a label wants a whole frame from its first number on and a width and height above 0, not "
+                f"frame {frame:g}, {width:g} x {height:g} px"
+            )
+        size, boxes = np.array([width, height]), labels.setdefault(int(frame), [])
+        # A box of w pixels from column x covers columns x to x + w - 1.
+        number = len(boxes) + 1 if target is None else int(target)
+        boxes.append(Label(np.array([x, y]) + (size - 1) / 2, size, number, bool(counts)))
+    if not labels:
+        raise ConfigError(f"{path}: holds no label, but for the names of its columns; it wants a row for each box")
+    return labels
+
+
+def _label_rows(path: Path) -> Iterable[tuple[float, float | None, float, float, float, float, float]]:
+    """Rows of a file of labels: frame and target, left, top, width and height, all from 0, and whether it counts."""
+    if _is_mot(path):
+        what = "ground truth of the MOT-challenge"
+        for row in read_table(path, dict.fromkeys(MOT_COLUMNS, _finite), what, names=MOT_COLUMNS):
+            frame, target, left, top, *rest = (row[name] for name in MOT_COLUMNS)
+            yield frame - 1, target, left - 1, top - 1, *rest
+    else:
+        for row in read_table(path, dict.fromkeys(LABELS, _finite), "table of labels", optional={"target": _finite}):
+            frame, *box = (row[name] for name in LABELS)
+            yield frame, row.get("target"), *box, 1.0
+
+
+def _is_mot(path: Path) -> bool:
+    """Whether the first line of a file begins with a number."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            return file.readline().split(",")[0].strip().isdecimal()
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def read_tracks(path: Path) -> list[Tracked]:
+    """Read the table that `cotarget.detect_video.run_on_film` writes.
+
+    Raises:
+        ConfigError: the file is missing, or is no such table.
+    """
+    names = ("frame", "t", "track", "u_px", "v_px", "width_px", "height_px")
+    return [
+        Tracked(np.array([u, v]), np.array([width, height]), int(frame), t, int(track))
+        for frame, t, track, u, v, width, height in (
+            (row[name] for name in names) for row in read_table(path, dict.fromkeys(names, _finite), "table of tracks")
+        )
+    ]
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
