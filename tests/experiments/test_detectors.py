@@ -80,15 +80,3 @@ def test_a_shaken_camera_is_judged_as_if_it_stood():
     shift = np.array([40.0, 0.0])
     assert watch(lambda t: [at("a", t) + shift, at("b", t) + shift], shift, SHAKES)["found"] == 1.0
     assert watch(lambda t: [at("a", t) + shift, at("b", t) + shift], camera=SHAKES)["found"] == 0.0
-
-
-def test_where_nobody_is_nothing_can_be_found():
-    rows = [
-        {"seed": 0, "scene": "five birds", "detector": "speck", "camera": STANDS, "found": 0.9, "false_per_min": 0.0,
-         "switches_per_min": 1.0},
-        {"seed": 0, "scene": "no bird", "detector": "speck", "camera": STANDS, "found": None, "false_per_min": 3.0,
-         "switches_per_min": None},
-    ]  # fmt: skip
-    summary = detectors.summarise(rows)
-    assert set(summary["no bird"]["speck, stands"]) == {"false_per_min"}
-    assert summary["five birds"]["speck, stands"]["found"]["median"] == 0.9

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import distributed
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -358,18 +359,6 @@ def end_of(program, tmp_path):
     return program.communicate()
 
 
-def test_a_killed_worker_costs_its_seed_a_second_try(started, tmp_path):
-    program = started()
-    all_wait(tmp_path)
-    lines = (tmp_path / "done").read_text().splitlines()
-    os.kill(next(int(line.split()[-1]) for line in lines if line.startswith("job 2")), signal.SIGKILL)
-    until(lambda: len(notes(tmp_path)) == 5, "the seed is tried again")
-    _, complaints = end_of(program, tmp_path)
-    assert (program.returncode, "python -m experiments:" in complaints) == (0, False)
-    assert sorted(notes(tmp_path)) == ["job 0", "job 1", "job 2", "job 2", "job 3"]
-    assert len(list((tmp_path / "out").glob("*/rows/[0-9]*.csv"))) == 4
-
-
 def test_a_killed_run_goes_on_where_it_was(started, tmp_path):
     program = started()
     all_wait(tmp_path)
@@ -394,24 +383,24 @@ def test_ctrl_c_ends_all_processes_in_one_line(started, tmp_path):
     until(lambda: all(map(is_gone, pids(tmp_path))), "the workers have ended")
 
 
-def test_the_same_rows_from_dask_and_a_seed_that_kills_its_workers(tmp_path, capsys):
-    arguments = ["tiny", "alone", "--set", "tiny.fatal=[1]", "--set", "alone.fatal=[2]"]
+def test_the_same_rows_from_dask_a_laboratory_and_a_seed_that_kills_its_workers(tmp_path, capsys):
+    arguments = ["tiny", "alone", *noted(tmp_path, "tiny"), "--set", "tiny.fatal=[1]", "--set", "alone.fatal=[2]"]
     assert main([*arguments, "--processes", "2", "--out", str(tmp_path / "dask")], KNOWN, tmp_path) == 1
     complaints = capsys.readouterr().err
-    assert [line.partition("failed: ")[0] for line in complaints.splitlines() if "failed:" in line] == [
-        "python -m experiments: tiny, fatal=[1], seed 1 ",
-        "python -m experiments: alone, fatal=[2], seed 2 ",
-    ]
-    with pytest.MonkeyPatch.context() as patched:
-        for name, value in ONE_THREAD.items():
-            patched.setenv(name, value)
-        command = [sys.executable, "-c", ONLY_HERE, str(tmp_path / "here")]
-        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-    (ours,) = (tmp_path / "here").glob("tiny*/rows")
-    (theirs,) = (tmp_path / "dask").glob("tiny*/rows")
-    for name in ("000000.csv", "000002.csv", "000003.csv"):
-        assert (ours / name).read_bytes() == (theirs / name).read_bytes()
-    assert not (theirs / "000001.csv").exists()
+    failed = [line.partition("failed: ")[0] for line in complaints.splitlines() if "failed:" in line]
+    assert [line.rpartition(", seed ")[2] for line in failed] == ["1 ", "2 "]
+    assert notes(tmp_path).count("job 1") == 2  # it is tried once more
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None, env=ONE_THREAD
+    ) as laboratory:  # fmt: skip
+        arguments = ["tiny", "--scheduler", laboratory.scheduler_address, "--out", str(tmp_path / "laboratory")]
+        assert main(arguments, KNOWN, tmp_path) == 0
+    command = [sys.executable, "-c", ONLY_HERE, str(tmp_path / "here")]
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL, env=os.environ | ONE_THREAD)
+    found = [path.parent for out in ("here", "dask", "laboratory") for path in tmp_path.glob(f"{out}/tiny*/rows")]
+    for name in ("rows/000000.csv", "rows/000002.csv", "rows/000003.csv"):
+        assert len({(folder / name).read_bytes() for folder in found}) == 1
+    assert [(folder / "rows" / "000001.csv").exists() for folder in found] == [True, False, True]
 
 
 ONLY_HERE = """

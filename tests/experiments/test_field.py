@@ -16,11 +16,10 @@ from cotarget.pipeline import FollowSettings
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
-from experiments.following import dead_zone, delay, field, first_shot, five_targets, hold
+from experiments.following import delay, field, first_shot, five_targets
 from experiments.following.field_scenes import hold_config
 from experiments.following.first_shot import CAUSES, Shot, budget
 from experiments.following.wide_view import Seen, WideView, open_on, record
-from experiments.tables import spread
 from tests.support.rigs import with_zoom_head
 
 SMALL = 0.03  # relative: products of angles of a hundredth that are taken for sums
@@ -94,23 +93,6 @@ def test_without_prediction_the_offset_is_speed_times_delay(exact, monkeypatch):
     delay.plot(rows, Figure())
 
 
-def test_the_gain_of_prediction_is_a_ratio_of_medians_at_one_delay():
-    def row(name, delay_s, predict, closed_loop, offset):
-        return {"target": name, "delay_s": delay_s, "predict": predict, "closed_loop": closed_loop, "tpo_width": offset}
-
-    rows = [row("bird", 0.2, True, False, offset) for offset in (0.01, 0.02, 0.6)]
-    rows += [row("bird", 0.2, False, False, offset) for offset in (0.05, 0.1, 0.6)]
-    summary = delay.summarise(rows)
-    ways = {"with": spread([0.01, 0.02, 0.6]), "without": spread([0.05, 0.1, 0.6])}
-    assert ways["without"] == {"median": 0.1, "least": 0.05, "largest": 0.6}
-    assert summary["bird"]["wide view alone"] == {"200 ms": ways | {"times": 5.0}}
-    assert delay.missed(summary) == []  # the closed loop was not measured
-    rows += [row("bird", 0.2, True, True, 0.05), row("bird", 0.2, False, True, 0.1)]
-    assert delay.missed(delay.summarise(rows)) == ["bird"]
-    other = [row | {"delay_s": 0.4} for row in rows if not row["closed_loop"]]
-    assert delay.missed(delay.summarise(other)) == []  # nothing is wanted at other delays than the field's
-
-
 WALKED = 3.0, 5.0  # of a person who walks from 1 s on; nothing is left of how it was acquired [s]
 SETTLED = 7.4, 9.0  # who stops at 5 s and is known of 0.6 s later, with a head that was on its way [s]
 NO_WORSE = 1.2  # times the wide view's own offset: medians of 50 frames
@@ -181,68 +163,7 @@ def test_good_seconds_agree_with_the_rows(exact):
     assert found["person"] > 0
 
 
-@pytest.mark.slow
-def test_a_target_with_one_good_second_is_served(exact, monkeypatch):
-    monkeypatch.setattr(five_targets, "record", seen_well)
-    settings = five_targets.FiveSettings(kinds=("person",), seconds=3.6, closed_loop=False, calibrated=False)
-    rows = five_targets.one(settings, 0)
-    assert [row["policy"] for row in rows] == ["first-come", "nearest-deadline", "most-served"]
-    for row in rows:
-        good = [row[f"good_{i}_s"] for i in range(1, 6)]
-        assert row["served"] == sum(value >= 1.0 for value in good)
-        assert row["good_s"] == pytest.approx(sum(good))
-    five_targets.plot(rows, Figure())
-
-
-def test_the_best_policy_is_put_over_the_first():
-    def row(policy, served):
-        return {"kind": "bird", "policy": policy, "served": served}
-
-    rows = [row("first-come", 2), row("first-come", 1), row("nearest-deadline", 3), row("most-served", 4)]
-    summary = five_targets.summarise(rows)
-    of_three, of_four = ({"mean": n, "least": n, "most": n} for n in (3.0, 4.0))
-    first = {"mean": 1.5, "least": 1.0, "most": 2.0}
-    assert summary == {
-        "bird": {"first-come": first, "nearest-deadline": of_three, "most-served": of_four, "best over first": 4 / 1.5}
-    }
-    five_targets.plot(rows, Figure())
-    assert five_targets.missed(summary) == []
-    assert five_targets.missed(five_targets.summarise([*rows, row("first-come", 6)])) == ["bird"]
-    none = five_targets.summarise([row(policy, 0) for policy in ("first-come", "nearest-deadline", "most-served")])
-    assert five_targets.missed(none) == ["bird"]
-
-
 # ---------------------------------------------------------------- dead zone
-@pytest.mark.slow
-def test_the_deadband_saves_commands_on_a_book(exact, monkeypatch):
-    monkeypatch.setattr(dead_zone, "record", seen_well)
-    settings = dead_zone.DeadZoneSettings(targets=("book",), seconds=6.0, closed_loop=False, calibrated=False)
-    rows = dead_zone.one(settings, 0)
-    summary = dead_zone.summarise(rows)
-    # Half is what is asked for; that takes the zoom view, for in the wide one noise looks like motion.
-    assert summary["book"]["commands_per_min"]["over"] < 0.7
-    # One with every frame at 25 Hz, whether it changes the goal or not.
-    assert summary["book"]["commands_per_min"]["without"]["median"] == pytest.approx(1500, rel=0.02)
-
-
-def test_ratios_with_the_deadband_over_without():
-    def row(way, commands, reversals, offset):
-        return {
-            "target": "book",
-            "way": way,
-            "commands_per_min": commands,
-            "reversals_per_min": reversals,
-            "tpo_width_median": offset,
-        }
-
-    rows = [row("with", 10.0, 0.0, 0.021), row("without", 40.0, 0.0, 0.02)]
-    summary = dead_zone.summarise(rows)
-    assert {key: found["over"] for key, found in summary["book"].items()} == pytest.approx(
-        {"commands_per_min": 0.25, "reversals_per_min": 1.0, "tpo_width_median": 1.05}
-    )
-    assert names(dead_zone.missed(summary)) == ["book: reversals_per_min"]  # nothing cannot be halved, and is told
-    lost = [row("with", 10.0, 1.0, None), row("without", 40.0, 4.0, 0.02)]
-    assert names(dead_zone.missed(dead_zone.summarise(lost))) == ["book: tpo_width_median"]
 
 
 # ---------------------------------------------------------------- first shot
@@ -321,68 +242,13 @@ def test_a_shot_is_skipped_while_the_target_is_not_detected(exact, monkeypatch):
     assert set(names(first_shot.missed({"book": blind}))) == {f"book: {key}" for key in first_shot.WANTED}
 
 
-def test_a_correction_that_could_not_be_fired_counts_as_one_that_missed():
-    row = {"seed": 0, "target": "book", "fired": True, "on_target": True, "in_frame": True}
-    row |= {"tpo_width": 0.01, "found": True}
-    row |= dict.fromkeys(CAUSES, 0.01) | {"measured": math.hypot(*[0.01] * len(CAUSES)), "corrected_width": 0.01}
-    none = row | {"corrected_width": None}
-    assert first_shot.summarise([row, row, none])["book"]["corrected_width"] == 0.01
-    assert names(first_shot.missed(first_shot.summarise([row, row, none, none, none]))) == ["book: corrected_width"]
-
-
 def test_a_budget_is_summed_in_quadrature_over_shots_at_the_target():
-    def row(on_target, offset, **parts):
-        told = dict.fromkeys(CAUSES, 0.0) | parts
-        return {
-            "seed": int(on_target),
-            "target": "book",
-            "fired": True,
-            "on_target": on_target,
-            "in_frame": on_target,
-            "tpo_width": min(offset, 0.625),
-            "found": on_target,
-            "corrected_width": 0.01 if on_target else None,
-            "measured": offset,
-            **told,
-        }
-
-    rows = [row(True, 0.05, detection=0.03, size=0.04), row(True, 0.05, detection=0.03, size=0.04)]
-    figures = first_shot.summarise(rows)["book"]
-    assert (figures["sum"], figures["measured"], figures["sum over measured"]) == pytest.approx((0.05, 0.05, 1.0))
-    assert first_shot.missed({"book": figures}) == []
-    rows.append(row(False, 4.0, detection=4.0))
-    figures = first_shot.summarise(rows)["book"]
+    shot = {"seed": 0, "target": "book", "fired": True, "on_target": True, "in_frame": True, "tpo_width": 0.05}
+    shot |= {"found": True, "corrected_width": 0.01, "measured": 0.05} | dict.fromkeys(CAUSES, 0.0)
+    hit, none = shot | {"detection": 0.03, "size": 0.04}, shot | {"corrected_width": None}
+    elsewhere = hit | {"seed": 1, "on_target": False, "in_frame": False, "measured": 4.0, "detection": 4.0}
+    figures = first_shot.summarise([hit, hit, elsewhere])["book"]
     assert (figures["sum"], figures["measured"], figures["in_frame"]) == pytest.approx((0.05, 0.05, 2 / 3))
     assert figures[first_shot.SEEDS]["in_frame"] == {"median": 0.5, "least": 0.0, "largest": 1.0}
-    assert names(first_shot.missed({"book": figures})) == ["book: in_frame"]
-    unexplained = [row(True, 0.1, delay=0.05)]
-    assert names(first_shot.missed(first_shot.summarise(unexplained))) == ["book: tpo_width", "book: sum over measured"]
-
-
-# ---------------------------------------------------------------- hold
-def test_a_target_that_is_never_acquired_is_missed():
-    good = {"closeup_yield": 0.95, "in_frame_ratio": 1.0, "tpo_width_median": 0.01, "size_ratio_median": 1.0}
-    good |= {"fragmentation_per_min": 0.0, "time_to_acquire_s": 0.5, "identification": 1.0, "identification_wide": 0.0}
-    good |= {"tpe_px_median": 0.5, "false_tracks_per_min": 3.0, "commands_per_min": 60.0, "reversals_per_min": 30.0}
-    good |= {"lens_commands_per_min": 9.0}
-    rows = [{"target": "book", **good} for _ in range(3)]
-    summary = hold.summarise(rows)
-    assert summary["book"].keys() == good.keys()
-    assert summary["book"]["closeup_yield"] == {"median": 0.95, "least": 0.95, "largest": 0.95}
-    assert hold.missed(summary) == []
-    worst = hold.summarise([*rows, {"target": "book", **good, "closeup_yield": 0.5}])["book"]["closeup_yield"]
-    assert worst == {"median": 0.95, "least": 0.5, "largest": 0.95}
-    lost = {"target": "book", **good, "closeup_yield": 0.1, "time_to_acquire_s": None, "tpo_width_median": None}
-    assert hold.missed(hold.summarise([*rows, lost, lost])) == []  # medians
-    assert names(hold.missed(hold.summarise([*rows, *[lost] * 4]))) == [
-        "book: closeup_yield",
-        "book: tpo_width_median",
-        "book: time_to_acquire_s",
-    ]
-    assert math.isnan(hold.summarise([*rows, lost])["book"]["time_to_acquire_s"]["largest"])
-    never = {"target": "book", **dict.fromkeys(good), "closeup_yield": 0.0}
-    for key in ("in_frame_ratio", "identification"):  # who was never there has the least share, not the most
-        found = hold.summarise([{**row, key: 0.5} for row in rows] + [never, never])["book"]
-        assert found[key]["median"] == 0.5
-        assert hold.summarise([{**row, key: 0.5} for row in rows] + [never] * 4)["book"][key]["median"] == 0.0
-    hold.plot(rows, Figure())
+    # A correction that could not be fired counts as one that missed.
+    assert first_shot.summarise([hit, none, none])["book"]["corrected_width"] == math.inf

@@ -9,11 +9,10 @@ import pytest
 from experiments.wire import age, command, faults, latency, wire
 from experiments.wire.command import Notes, Turn
 from experiments.wire.rig import Tap
-from experiments.wire.wire import bounded, missed, summarise
+from experiments.wire.wire import summarise
 
 # Nothing here is a figure: the machine may be busy, and experiments/expected/wire.json is as patient. What is a third
 # of the line's rate is still polling.
-SOME = 0.3
 SHORT = replace(wire.QUICK, poll_s=1.0, age_s=1.5, targets=("book",), command_s=3.0, faults=("head.limit-hit",))
 CLOSE = 1e-9
 
@@ -71,42 +70,6 @@ def test_the_number_in_a_picture_can_be_read():
     assert [age.number_of(age.picture(number)) for number in (0, 1, 130, 255)] == [0, 1, 130, 255]
 
 
-def test_figures_from_rows():
-    """97 % of the line; ages that grow by 20 ms; one fault of two settled late, by a head that once never followed."""
-    ages = [{"figure": "age", "age_s": 0.02 + 0.02 * (i >= 20), "read_s": 0.0, "load": 1.0} for i in range(30)]
-    fault = {"figure": "faults", "outcome": "ended", "moved_deg": 1.0, "beyond_deg": 0.0, "ended_s": 1.0, "load": 2.0}
-    rows = [
-        {"figure": "polls", "case": "alone", "share": 0.97, "pairs_s": 58.2, "load": 0.5},
-        *ages,
-        fault | {"fault": "head.silence", "way": "held", "settled_s": 0.4},
-        fault | {"fault": "fixed.cut", "way": "held", "settled_s": 0.6},
-        {"figure": "faults", "fault": "fixed.cut", "way": "held", "outcome": "did not start", "load": 2.0},
-        {"figure": "latency", "what": "zoom", "measured_s": 0.075, "truth_s": 0.064, "load": 1.0},
-        {"figure": "parity", "pan_steps": 1.0000000001, "tilt_steps": 0.0, "load": 1.0},
-    ]
-    summary = summarise(rows)
-    reached = {name.split(",")[0]: figure["reached"] for name, figure in summary["figures"].items()}
-    assert reached["polls"]
-    assert summary["figures"]["age of the newest frame, longest"]["measured"] == pytest.approx(40)
-    assert not summary["figures"]["age, last third less first"]["reached"]
-    assert summary["faults"]["fixed.cut held"]["settled [s]"] == math.inf
-    assert summary["figures"]["faults of 2 for which that took longer"]["measured"] == 1
-    assert not reached["latency"]
-    assert reached["parity"]
-    assert summary["figures"]["parity, farthest apart"]["measured"] == pytest.approx(1.0)
-    assert summary["load"] == [0.5, 2.0]
-    assert len(missed(summary)) == 4
-    assert missed(summarise(rows[:1])) == []
-    assert bounded(summary)["latency, zoom"] == pytest.approx(11.0)
-
-
-def test_each_figure_is_a_job(monkeypatch):
-    monkeypatch.setitem(wire.RUNS, "age", lambda settings, folder: [{"figure": "age", "in": folder.is_dir()}])
-    settings = replace(SHORT, tries=1, only=("polls", "age"))
-    assert list(wire.jobs(settings)) == [0, 1]
-    assert wire.one(settings, 1) == [{"figure": "age", "in": True}]
-
-
 def test_directions_of_the_book():
     """By hand: at 3 s the book is 1.2 m left, 6 m away, as high as the cameras; the zoom camera is 0.4 m right."""
     pan, tilt = faults.directions(3.0)
@@ -146,14 +109,3 @@ def test_figures_disturbed_by_a_busy_machine_are_measured_again(monkeypatch, run
     rows = wire.one(settings, 0)
     assert [row["settled_s"] for row in rows] == [measured]
     assert summarise(rows)["again"] == ({"faults": {0.4: 2, 4.4: 3}[measured]} if measured in (0.4, 4.4) else {})
-
-
-@pytest.mark.wire
-@pytest.mark.slow
-def test_polls_are_counted_on_the_line():
-    row = wire.polls.poll_alone((0, 0), 1.0)
-    # "PP " and "* 0\r\n", and the same for tilt: 16 bytes, but for what the first and the last pair leave over.
-    assert row["bytes"] == pytest.approx(16.0, abs=0.5)
-    assert SOME < row["share"] <= 1.0 + 1 / 30
-    assert row["pairs_s"] == pytest.approx(row["share"] * 60, rel=0.05)
-    assert np.isfinite(row["share"])
