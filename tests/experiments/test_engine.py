@@ -1,6 +1,7 @@
 """Sweeps: every seed once, whatever happens to the others or to the program; the same rows whoever does them."""
 
 import contextlib
+import fcntl
 import json
 import math
 import os
@@ -34,7 +35,7 @@ from experiments.engine import (
 )
 from experiments.report import Bound, compare
 from experiments.tables import as_text, number, outside, rms, spread, spread_columns
-from tests.support.tiny_experiments import KNOWN, TINY, here, here_together, notes, pids
+from tests.support.tiny_experiments import KNOWN, TINY, here, here_together, notes, pids, timed
 
 DEADLINE_S = 120.0  # for a program to come as far as it is waited for
 ROOT = Path(__file__).parents[2]
@@ -79,7 +80,41 @@ def test_each_seed_once_and_timings_last(run, tmp_path):
     assert result["settings"]["factor"] == 1.0
     (log, *_) = read_rows(folder / "seeds.csv")
     assert (log["version"], log["failed"]) == (code_version(), None)
+    assert len((folder / "seeds.csv").read_text().splitlines()) == 1 + 4
     assert str(tmp_path / "out" / "report.html") in told
+    assert "Values of each seed." in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_longest_begin_first(run, tmp_path):
+    known = KNOWN | {"long": lambda: replace(TINY, name="long", one=timed, cost_s=9.0)}
+    assert run("tiny", "long", *noted(tmp_path, "tiny", "long"), "--seeds", "1", known=known)[0] == 0
+    assert notes(tmp_path) == ["alone 0", "job 0"]
+
+
+def test_workers_are_no_more_than_jobs_and_end_before_times_are_measured(tmp_path):
+    events = []
+
+    @contextlib.contextmanager
+    def together(processes, scheduler):
+        events.append(processes)
+        yield here
+        events.append("ended")
+
+    def apart(jobs):
+        events.append("timed")
+        yield from here(jobs)
+
+    arguments = ["tiny", "alone", "--seeds", "1", "--processes", "7", "--out", str(tmp_path)]
+    assert main(arguments, KNOWN, tmp_path, together, apart) == 0
+    assert events == [1, "ended", "timed"]
+
+
+def test_a_folder_is_locked_by_the_run_that_writes_to_it(run, tmp_path):
+    (tmp_path / "out").mkdir()
+    with (tmp_path / "out" / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        status, _, complaints = run("tiny")
+    assert (status, complaints.count("\n"), "another run" in complaints) == (1, 1, True)
 
 
 def test_more_seeds_are_added_to_those_that_are_there(run, tmp_path):
@@ -137,6 +172,11 @@ def test_a_seed_that_fails_is_recorded_and_the_rest_goes_on(run, tmp_path):
     (tmp_path / "mended").touch()
     assert run(*wrong)[0] == 0
     assert notes(tmp_path)[4:] == ["job 1"]
+    assert not (folder / "000001.txt").exists()
+    (tmp_path / "mended").unlink()
+    assert run(*wrong)[0] == 0
+    assert run(*wrong, "--fresh")[0] == 1
+    assert run(*wrong, "--fresh", "--seeds", "1")[0] == 0
     assert not (folder / "000001.txt").exists()
 
 
@@ -200,6 +240,13 @@ def test_results_of_other_settings_or_other_code_are_refused(run, tmp_path):
     assert (status, "0.0.9+1.2" in told) == (0, True)
     assert run("tiny", "--seeds", "2", "--fresh")[0] == 0
     assert "0.0.9" not in log.read_text()
+    assert "--fresh" not in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_version_tells_code_and_libraries_apart(monkeypatch):
+    monkeypatch.setattr("experiments.engine.libraries_used", lambda: {"numpy": "0"})
+    ours, other = (version.split(".") for version in (code_version(), code_version.__wrapped__()))
+    assert (ours[:-1], ours[-1] != other[-1]) == (other[:-1], True)
 
 
 def test_a_worker_with_other_code_ends_the_run(run, tmp_path):
@@ -222,6 +269,7 @@ def test_bounds_only_tighten(run, tmp_path):
     status, told, _ = run("tiny", "--quick", "--update-expected")
     assert (status, "by / worst" in told) == (1, True)
     assert json.loads(path.read_text()) == {"total": 0.5, "by": {"worst": {"at_most": 1.0}}, "rows": {"at_least": 4.0}}
+    assert run("tiny", out="full")[0] == 0  # bounds are of quick runs
     (tmp_path / "alone.json").write_text('{"total": 9.0}')
     assert run("alone", "--quick", "--update-expected")[0] == 0
     assert json.loads((tmp_path / "alone.json").read_text()) == {"total": 9.0}  # of times none is written
@@ -245,11 +293,16 @@ def test_a_bound_allows_a_tenth(kind, bound, good, bad):
     assert not Bound("", kind, bound, bad).kept
 
 
+def test_a_bound_becomes_a_better_value_of_four_digits():
+    kinds = (("at_most", 5.0), ("at_most", 3.0), ("at_least", 3.0), ("at_least", 5.0), ("within", (3.0, 5.0)))
+    assert [Bound("", kind, bound, 4.00004).tighter for kind, bound in kinds] == [4.0, None, 4.0, None, None]
+
+
 def test_a_bound_whose_figure_is_gone_is_broken(tmp_path):
     path = tmp_path / "tiny.json"
-    path.write_text('{"total": 1.0, "other": {"figure": 1.0}, "by": 1.0}')
-    found = compare("tiny", {"total": 1.09, "by": float("nan")}, tmp_path)
-    assert [(bound.name, bound.kept) for bound in found] == [("total", True), ("other / figure", False), ("by", False)]
+    path.write_text('{"total": 1.0, "other": {"figure": 1.0}, "by": 1.0, "is": 1}')
+    found = compare("tiny", {"total": 1.09, "by": math.nan, "is": True}, tmp_path)
+    assert [bound.name for bound in found if not bound.kept] == ["other / figure", "by", "is"]
     for wrong in ("{", '{"total": "low"}', '{"total": {"within": [1]}}'):
         path.write_text(wrong)
         with pytest.raises(ConfigError, match=r"tiny\.json"):
@@ -393,8 +446,10 @@ def test_the_same_rows_from_dask_a_laboratory_and_a_seed_that_kills_its_workers(
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, dashboard_address=None, env=ONE_THREAD
     ) as laboratory:  # fmt: skip
-        arguments = ["tiny", "--scheduler", laboratory.scheduler_address, "--out", str(tmp_path / "laboratory")]
-        assert main(arguments, KNOWN, tmp_path) == 0
+        (tmp_path / "notes").mkdir()
+        arguments = ["tiny", *noted(tmp_path / "notes", "tiny"), "--scheduler", laboratory.scheduler_address]
+        assert main([*arguments, "--out", str(tmp_path / "laboratory")], KNOWN, tmp_path) == 0
+    assert notes(tmp_path / "notes") == [f"job {seed}" for seed in range(4)]
     command = [sys.executable, "-c", ONLY_HERE, str(tmp_path / "here")]
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL, env=os.environ | ONE_THREAD)
     found = [path.parent for out in ("here", "dask", "laboratory") for path in tmp_path.glob(f"{out}/tiny*/rows")]
