@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 import socket
 import threading
 
@@ -103,18 +102,3 @@ def test_a_program_that_does_not_answer_as_it_should(answer, said):
         port = server.getsockname()[1]
     with pytest.raises(DeviceError, match=r"^hardware\.board\.presenter: "):
         SocketBoard("127.0.0.1", port)
-
-
-@pytest.mark.wire
-def test_what_is_no_json_is_answered_and_the_server_goes_on():
-    with (
-        JsonLines(lambda said: {"twice": 2 * said["n"]}) as server,
-        socket.create_connection(("127.0.0.1", server.port), DEADLINE_S) as client,
-        client.makefile("rwb") as lines,
-    ):
-        for said in (b"nonsense\n", b"[" * 60000 + b"\n", b'{"m": 1}\n', b'{"n": 2}\n'):
-            lines.write(said)
-            lines.flush()
-        *refused, well = (json.loads(lines.readline()) for _ in range(4))
-    assert all("not understood" in reply["error"] for reply in refused)
-    assert well == {"twice": 4}

@@ -1,16 +1,18 @@
-"""`PolledHead` on a unit of another protocol than the D46's: both axes report at once, and a move is one message."""
+"""`PolledHead` on a unit whose axes report both at once and take a move in one message, in simulated time."""
 
 import math
+import signal
 import threading
 from dataclasses import replace
 
 import pytest
 
 from cotarget.config import SafetyConfig
-from cotarget.drivers.interlock import PositionLostError
+from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
 from cotarget.drivers.polled_head import AxisFacts, CutError, Poll, PolledHead, PolledHeadSettings
 from cotarget.drivers.serial_line import LostError, RefusedError, SilentError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
+from tests.support.plants import DEADLINE_S, fails, wait_for
 from tests.support.simulated_clock import SimClock
 
 STEP = math.radians(0.1)
@@ -32,9 +34,13 @@ class CounterLink:
         self.fails = []  # errors of the next moves
         self.polls_fail = []  # errors of the next polls; the last one for ever before an Ellipsis
         self.stuck = self.restless = False
+        self.meanwhile = lambda: None  # called once after the next move was sent, before a poll
 
     def poll(self):
         self.clock.sleep_until(self.clock.now() + EXCHANGE_S)
+        if self.sent:
+            act, self.meanwhile = self.meanwhile, lambda: None
+            act()
         if self.polls_fail:
             error = self.polls_fail[0]
             if self.polls_fail[1:] != [...]:
@@ -70,28 +76,26 @@ class CounterLink:
         self.sent.append("closed")
 
 
-def ask_again_and_again(head, times=100_000):
-    for _ in range(times):
-        head.state()
-
-
 @pytest.fixture
 def link():
     return CounterLink(SimClock())
 
 
 @pytest.fixture
-def opened(link, tmp_path):
+def opened(link, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     heads = []
 
-    def open_head(**settings):
+    def open_head(safety=None, **settings):
         config = PolledHeadSettings(**{**SETTINGS, **settings})
-        heads.append(PolledHead(lambda: link, config, link.clock, SafetyConfig(stop_file=tmp_path / "stop")))
+        safety = SafetyConfig(**{"stop_file": tmp_path / "stop", **(safety or {})})
+        heads.append(PolledHead(lambda: link, config, link.clock, safety))
         return heads[-1]
 
     yield open_head
     for head in heads:
         head.close()
+    assert not any(thread.name.startswith("head at") for thread in threading.enumerate())
 
 
 def test_it_moves_in_its_units_with_its_signs(opened, link):
@@ -99,8 +103,15 @@ def test_it_moves_in_its_units_with_its_signs(opened, link):
     assert math.degrees(head.limits.speed) == pytest.approx(40.0)
     pan, tilt = head.move(math.radians(10.04), math.radians(-120.0), wait=True)
     assert (math.degrees(pan), math.degrees(tilt)) == (pytest.approx(10.0), pytest.approx(-90.0))
+    assert head.state().tilt == tilt
     head.move(0.0, 0.0, speed=(math.radians(10.0), math.radians(20.0)), wait=True)
     assert link.sent == [((100, 900), (400, 400)), ((0, 0), (100, 200))]
+
+
+@pytest.mark.parametrize(("asked", "sent"), [(None, 400), (100.6 * STEP, 100), (58 * STEP, 58), (1e-9, 10), (1e9, 400)])
+def test_speeds_are_whole_steps_within_the_units_and_the_files_bounds(opened, link, asked, sent):
+    opened().move(STEP, STEP, speed=asked, wait=True)
+    assert link.sent == [((1, -1), (sent, sent))]
 
 
 def test_limits_and_braking_are_those_of_the_weaker_axis(opened, link):
@@ -124,20 +135,29 @@ def test_closing_sends_a_last_halt_before_the_port_is_closed(opened, link):
             call()
 
 
-def test_a_refused_move_is_halted_and_raises(opened, link):
+def test_closing_raises_in_a_move_that_waits(opened, link):
+    head, said = opened(), []
+    link.stuck, link.meanwhile = True, lambda: wait_for(link.hurry)
+    thread = threading.Thread(target=lambda: said.append(fails(lambda: head.move(STEP, 0.0, wait=True))))
+    thread.start()
+    wait_for(lambda: link.sent)
+    head.close()
+    thread.join(DEADLINE_S)
+    assert said == ["the pan-tilt unit at COUNTER is closed"]
+
+
+@pytest.mark.parametrize("wait", [True, False])
+def test_a_refused_move_is_halted_and_raises_in_its_wait_or_the_next_call(opened, link, wait):
     head = opened()
     link.fails = [RefusedError("no")]
-    with pytest.raises(DeviceError, match=r"^no$"):
-        head.move(0.1, 0.1, wait=True)
+    if wait:
+        with pytest.raises(DeviceError, match=r"^no$"):
+            head.move(0.1, 0.1, wait=True)
+    else:
+        head.move(0.1, 0.1)
+        assert fails(head.state) == "no"
     assert link.sent[-1] == "halt"
     head.move(0.2, 0.2, wait=True)
-
-
-def test_a_move_cut_by_a_silence_is_sent_again_to_a_caller_that_waits(opened, link):
-    head = opened()
-    link.fails = [CutError("silent for a while")]
-    head.move(STEP, STEP, wait=True)
-    assert [goals for goals, _ in link.sent] == [(1, -1), (1, -1)]
 
 
 @pytest.mark.parametrize("between", [True, False])
@@ -146,49 +166,138 @@ def test_repeated_silence_without_a_position_ends_the_head(opened, link, between
     cut = CutError("silent for a while")
     link.polls_fail = [cut, cut, None] * 10 if between else [cut, ...]
     if between:
-        while link.polls_fail:
-            head.state()
+        wait_for(lambda: not link.polls_fail)
         head.move(STEP, 0.0, wait=True)
     else:
-        with pytest.raises(DeviceError, match="silent for a while"):
-            ask_again_and_again(head)
+        assert fails(head.state) == "silent for a while"
         head.close()
         assert link.sent == ["last halt", "closed"]
 
 
 @pytest.mark.parametrize(
-    ("error", "halted"),
-    [(SilentError("it is silent"), True), (DeviceError("no"), True), (LostError("COUNTER", OSError("gone")), False)],
+    ("error", "said", "halted"),
+    [
+        (SilentError("it is silent"), "it is silent", True),
+        (LostError("COUNTER", OSError("gone")), "is lost", False),
+        (ValueError("a mistake"), "test_polled_head.py:", True),  # a mistake in a link is named by file and line
+    ],
 )
-def test_an_error_ends_in_a_last_halt_unless_the_port_is_lost(opened, link, error, halted):
+def test_an_error_ends_in_a_last_halt_unless_the_port_is_lost(opened, link, error, said, halted):
     head = opened()
     link.polls_fail = [error, ...]
-    with pytest.raises(DeviceError, match=str(error).split("(")[0]):
-        ask_again_and_again(head)
+    for call in (lambda: head.move(STEP, 0.0, wait=True), head.state):
+        assert said in fails(call)
+    if halted:
+        head.halt()
+    else:
+        assert said in fails(head.halt)
     head.close()
-    assert link.sent == ["last halt", "closed"] if halted else ["closed"]
+    assert [each for each in link.sent if isinstance(each, str)] == ["last halt", "closed"] if halted else ["closed"]
+    link.polls_fail = []
+    opened().move(STEP, 0.0, wait=True)  # the position is not lost
 
 
-def test_a_head_that_does_not_arrive_is_not_opened_again(opened, link):
+LIMIT = [PositionLostError("COUNTER", "hit its limit"), ...]
+# How a position is lost: whether while the head is opened, attributes of the link then, and a text of the error.
+EVENTS = {
+    "a limit while it is opened": (True, {"polls_fail": LIMIT}, "hit its limit"),
+    "a limit": (False, {"polls_fail": LIMIT}, "hit its limit"),
+    "a limit, and a mistake in the last halt": (False, {"polls_fail": LIMIT, "halt_last": None}, "hit its limit"),
+    "a stall": (False, {"stuck": True}, "pan 0, tilt 0 steps, where 1, 0 were commanded"),
+}
+
+
+@pytest.mark.parametrize("stop_file", [False, True])
+@pytest.mark.parametrize("event", EVENTS)
+def test_a_lost_position_is_remembered_until_the_unit_was_reset(opened, link, tmp_path, event, stop_file):
+    """By every later program, which does not even open the port; beside the stop file, if there is one."""
+    opening, changes, words = EVENTS[event]
+    safety = {"stop_file": tmp_path / "run" / "stop" if stop_file else None}
+    head = None if opening else opened(safety)
+    vars(link).update(changes)
+    said = fails(lambda: opened(safety) if opening else head.move(STEP, 0.0, wait=True))
+    assert words in said
+    if head:
+        assert fails(head.state) == said
+        head.close()
+    file = tmp_path / ("run/stop.COUNTER.position-lost" if stop_file else "cotarget/head.COUNTER.position-lost")
+    assert file.read_text() == f"{said}\n"
+    link.sent.clear()
+    for port in ("COUNTER", "ANOTHER"):  # as an adapter that was replugged may have
+        again = fails(lambda port=port: opened(safety, port=port))
+        assert again.startswith(said)
+        assert str(file) in again
+    assert link.sent == []
+    PositionLostMarker("COUNTER", safety["stop_file"]).forget()
+    vars(link).update(polls_fail=[], stuck=False, halt_last=lambda patience: None)
+    opened(safety).state()
+
+
+# Halts
+
+
+def test_halts_from_many_threads(opened, link):
     head = opened()
     link.stuck = True
-    with pytest.raises(DeviceError, match="pan 0, tilt 0 steps, where 1, 0 were commanded"):
+    head.move(STEP, 0.0)
+    threads = [threading.Thread(target=head.halt) for _ in range(5)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(DEADLINE_S)
+        assert not thread.is_alive()
+    assert link.sent[-1] == "halt"
+
+
+def test_a_signal_handler_may_halt_whatever_it_interrupts(opened, link):
+    head, halted = opened(), []
+
+    def handler(*_):
+        head.halt()
+        halted.append(link.sent[-1] == "halt")
+
+    def interrupt():
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGUSR1)
+        wait_for(link.hurry)
+
+    link.stuck, link.meanwhile = True, interrupt
+    before = signal.signal(signal.SIGUSR1, handler)
+    try:
+        with pytest.raises(HaltedError):
+            head.move(STEP, 0.0, wait=True)
+        for _ in range(50):
+            signal.raise_signal(signal.SIGUSR1)
+            head.state()
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert halted == [True] * 51
+
+
+def test_a_halted_move_may_be_commanded_again(opened, link):
+    head = opened()
+    halts = threading.Thread(target=head.halt)
+
+    def halt():
+        halts.start()
+        wait_for(link.hurry)
+
+    link.stuck, link.meanwhile = True, halt
+    with pytest.raises(HaltedError):
         head.move(STEP, 0.0, wait=True)
-    head.close()
-    with pytest.raises(DeviceError, match="cotarget reset-head"):
-        opened()
-
-
-def silent(*_):
-    raise SilentError("it is silent")
+    halts.join(DEADLINE_S)
+    link.stuck = False
+    head.move(STEP, 0.0, wait=True)
+    assert head.state().pan == pytest.approx(STEP)
 
 
 def test_a_halt_of_a_dead_unit_is_sent_and_raises(opened, link):
+    def silent(*_):
+        raise SilentError("it is silent")
+
     head = opened()
     link.polls_fail, link.halt_last = [SilentError("it is silent"), ...], silent
-    for call in (lambda: ask_again_and_again(head), head.halt):
-        with pytest.raises(DeviceError, match="silent"):
-            call()
+    for call in (head.state, head.halt):
+        assert "silent" in fails(call)
     assert link.sent == ["halt without an answer"]
 
 
@@ -199,55 +308,41 @@ def test_a_link_that_hangs_holds_up_neither_a_halt_nor_the_end(opened, link, mon
 
     def poll():
         hangs.set()
-        release.wait(20.0)
+        release.wait(DEADLINE_S)
         return CounterLink.poll(link)
 
     head = opened()
     link.poll = poll
-    assert hangs.wait(20.0)
+    assert hangs.wait(DEADLINE_S)
     with pytest.raises(DeviceError, match="COUNTER did not acknowledge a halt"):
         head.halt()
     head.close()
     assert "does not end" in caplog.text
     release.set()
+    wait_for(lambda: not head._thread.is_alive())
 
 
-def test_an_exception_in_the_last_halt_keeps_the_marker(opened, link):
-    def halt_last(patience):
-        raise ValueError("a mistake")
-
-    head = opened()
-    link.polls_fail = [PositionLostError("COUNTER", "hit its limit"), ...]
-    link.halt_last = halt_last
-    with pytest.raises(DeviceError, match="hit its limit"):
-        ask_again_and_again(head)
-    head.close()
-    with pytest.raises(DeviceError, match="cotarget reset-head"):
-        opened()
-
-
-# What ends a start, the key or text of the error, and what the unit is sent.
+# What ends a start: settings, safety, the link's attributes, and the key or text of the error.
 STARTS = {
-    "other limits": ({"pan_deg": (-180.0, 180.0)}, {}, ConfigError, "hardware.head.pan_deg: "),
-    "other steps": ({"step_deg": 0.2}, {}, ConfigError, "hardware.head.step_deg: "),
-    "too slow": ({"speed_deg_s": 0.5}, {}, ConfigError, "hardware.head.speed_deg_s: "),
-    "an error": ({}, {"polls_fail": [ValueError("a mistake"), ...]}, ValueError, "a mistake"),
-    "no rest": ({}, {"restless": True}, DeviceError, "goes on turning"),
+    "too slow": ({"speed_deg_s": 0.5}, {}, {}, r"^hardware\.head\.speed_deg_s: .* 1 at least"),
+    "too low a cap": ({}, {"speed_deg_s": 0.5}, {}, r"^safety\.speed_deg_s: .* 1 at least"),
+    "a mistake": ({}, {}, {"polls_fail": [ValueError("a mistake"), ...]}, "a mistake"),
+    "no rest": ({}, {}, {"restless": True}, "goes on turning"),
 }
 
 
 @pytest.mark.parametrize("name", STARTS)
 def test_a_start_that_fails_ends_in_a_halt_and_closes_the_port(opened, link, name):
-    settings, changes, kind, said = STARTS[name]
+    settings, safety, changes, said = STARTS[name]
     for attribute, value in changes.items():
         setattr(link, attribute, value)
-    with pytest.raises(kind, match=said):
-        opened(**settings)
+    with pytest.raises((ConfigError, DeviceError, ValueError), match=said):
+        opened(safety, **settings)
     assert link.sent == ["last halt", "closed"]
 
 
-@pytest.mark.parametrize("missing", ["poll", "halt_last", "axes", "name", "close"])
-def test_a_link_without_a_required_part_is_refused_and_closed(opened, link, missing):
+@pytest.mark.parametrize("missing", ["poll", "axes", "name", "close"])
+def test_a_link_without_a_required_part_is_refused_and_closed(link, missing):
     class Lacking:
         def __getattr__(self, name):
             if name == missing:
@@ -257,27 +352,3 @@ def test_a_link_without_a_required_part_is_refused_and_closed(opened, link, miss
     with pytest.raises(ConfigError, match=f"^hardware.head.driver: Lacking has no {missing}"):
         PolledHead(Lacking, PolledHeadSettings(**SETTINGS), link.clock)
     assert link.sent == ([] if missing == "close" else ["closed"])
-
-
-def test_a_newer_move_takes_the_place_of_one_that_waits(opened, link):
-    head = opened()
-    link.stuck = True
-    send = link.move
-
-    def newer(goals, speeds, proceed):
-        link.move, link.stuck = send, False
-        head.move(5 * STEP, 0.0)
-        proceed()
-
-    link.move = newer
-    with pytest.raises(HaltedError):
-        head.move(STEP, 0.0, wait=True)
-
-
-def test_an_exception_in_a_link_halts_and_names_file_and_line(opened, link):
-    head = opened()
-    link.polls_fail = [ValueError("a mistake"), ...]
-    with pytest.raises(DeviceError, match=r"ValueError\('a mistake'\) \(.*test_polled_head\.py:\d+\)$"):
-        ask_again_and_again(head)
-    head.halt()
-    assert link.sent == ["last halt"]

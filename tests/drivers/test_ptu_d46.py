@@ -1,5 +1,6 @@
 """The driver of the PTU-D46 in simulated time: opening a unit, moving it, and every fault of unit and line."""
 
+import contextlib
 import itertools
 import math
 import random
@@ -9,15 +10,15 @@ import pytest
 import serial
 
 from cotarget.drivers.interlock import PositionLostError
-from cotarget.drivers.ptu_d46 import D46Head, UncalibratedError
+from cotarget.drivers.ptu_d46 import D46Head, D46Settings, UncalibratedError
 from cotarget.drivers.ptu_protocol import open_line
 from cotarget.drivers.serial_line import InUseError, LostError, NoPermissionError, SilentError
 from cotarget.errors import ConfigError, DeviceError
-from tests.support.d46_bench import CONFIG, Bench
-from tests.support.d46_peer import BANNER, VERSION
+from tests.support.d46_peer import BANNER, CONFIG, VERSION, Bench
 from tests.support.simulated_clock import SimClock
 
 BYTE = 10 / 9600
+STEP = math.radians(185.1428 / 3600)
 FROM_FAULT_TO_HALT = 0.5  # issue 4's figure [s]
 # Commands that neither move the head nor wear its memory.
 HARMLESS = {"ED", "FT", "E", "F", "V", "WP", "C", "CI", "I", "H", "PP", "TP"}
@@ -40,11 +41,6 @@ def opened(bench, monkeypatch):
 # Ports
 
 
-def test_no_port_is_named():
-    with pytest.raises(ConfigError, match=r"^hardware\.head\.port: "):
-        open_line("", 9600, SimClock())
-
-
 @pytest.mark.parametrize(("port", "exclusive"), [("/dev/ttyUSB0", True), ("socket://host:4000", None)])
 def test_a_port_is_opened_with_time_limits_and_a_device_for_one_program(monkeypatch, port, exclusive):
     options = {}
@@ -55,24 +51,33 @@ def test_a_port_is_opened_with_time_limits_and_a_device_for_one_program(monkeypa
     assert 0 < options["write_timeout"] <= FROM_FAULT_TO_HALT
 
 
+# Ports that cannot be opened: what pyserial raises, None for the real port's; the kind and a text of the error, which
+# also names the port.
 CANNOT_OPEN = [
-    (serial.SerialException(2, "could not open port"), DeviceError, "serial ports here:"),
-    (serial.SerialException(13, "could not open port"), NoPermissionError, "group"),
-    (serial.SerialException(11, "could not lock"), InUseError, "another program"),
-    (serial.SerialException("Could not configure port"), DeviceError, "Could not configure"),
-    (ValueError("invalid URL"), DeviceError, "invalid URL"),
+    ("", None, ConfigError, r"^hardware\.head\.port: "),
+    ("PORT", serial.SerialException(13, "could not open port"), NoPermissionError, "group"),
+    ("PORT", serial.SerialException(11, "could not lock"), InUseError, "another program"),
+    ("FOLDER", None, DeviceError, "cannot open"),
+    ("FOLDER/missing", None, DeviceError, "serial ports here:"),
+    ("socket://127.0.0.1:1", None, DeviceError, "cannot connect"),
+    ("socket://no.such.host.invalid:4000", None, DeviceError, "cannot connect"),
+    ("socket://127.0.0.1", None, DeviceError, "hardware.head.port: .*write socket://HOST:PORT"),
+    ("socket://terminal:four", None, DeviceError, "hardware.head.port: .*write socket://HOST:PORT"),
+    ("sockt://a:1", None, DeviceError, "invalid URL"),
 ]
 
 
-@pytest.mark.parametrize(("error", "kind", "said"), CANNOT_OPEN)
-def test_ports_that_cannot_be_opened(monkeypatch, error, kind, said):
+@pytest.mark.parametrize(("port", "error", "kind", "said"), CANNOT_OPEN)
+def test_ports_that_cannot_be_opened(monkeypatch, tmp_path, port, error, kind, said):
     def refuse(*_, **__):
         raise error
 
-    monkeypatch.setattr(serial, "serial_for_url", refuse)
+    if error:
+        monkeypatch.setattr(serial, "serial_for_url", refuse)
+    port = port.replace("FOLDER", str(tmp_path))
     with pytest.raises(kind, match=said) as caught:
-        open_line("PORT", 9600, SimClock())
-    assert "PORT" in str(caught.value)
+        open_line(port, 9600, SimClock())
+    assert port in str(caught.value)
 
 
 # Opening
@@ -89,22 +94,6 @@ def test_a_unit_is_identified_in_any_manner(echo, verbose):
     assert (bench.unit.echo, bench.unit.verbose) == (False, False)
     assert set(bench.unit.heard) <= HARMLESS
     assert bench.unit.goals() == (0, 0)
-
-
-def test_a_unit_left_turning_is_halted_even_if_a_byte_of_noise_comes_before_the_halt(bench):
-    """It hears "xH", or with a delimiter in front of the halt "x" and "H"."""
-    bench.unit.way["P"] = (bench.clock.now(), 0, 3000)
-    bench.unit.scripted = {noise: [b"! Illegal argument\r\n"] for noise in ("x", "xH")}
-    last = bench.unit.obey
-
-    def obey(order):
-        if order == "TA":  # the last question before the halt
-            bench.unit.noise = b"x"
-        return last(order)
-
-    bench.unit.obey = obey
-    bench.connect()
-    assert not bench.unit.turning()
 
 
 def test_a_leading_line_feed_and_what_was_left_in_the_line_do_no_harm(bench):
@@ -162,6 +151,7 @@ NO_UNITS = {
         for says in STRANGERS
     },
     "one without sense": (lambda bench: bench.unit.facts.update(PU=0), "speeds from 31 to 0"),
+    "one that is not calibrated": (lambda bench: bench.unit.facts.update(TN=0, TX=0), "cotarget reset-head"),
 }
 
 
@@ -216,31 +206,7 @@ def test_a_probe_refuses_a_missing_or_uncalibrated_unit(opened, answers, kind):
         D46Head.probe(CONFIG)
 
 
-def test_an_uncalibrated_unit_waits_for_an_operator(bench):
-    bench.unit.facts |= {"TN": 0, "TX": 0}
-    with pytest.raises(UncalibratedError, match="cotarget reset-head"):
-        bench.connect()
-    assert "R" not in bench.unit.heard
-
-
 # Positions
-
-
-def test_positions_are_stamped_with_the_time_at_which_the_unit_looked(bench):
-    looked = []
-    bench.start()
-    obey = bench.unit.obey
-
-    def watch(order):
-        if order in ("PP", "TP"):
-            looked.append(bench.clock.now())
-        return obey(order)
-
-    bench.unit.obey = watch
-    for turn in range(10):
-        bench.loop.turn()
-        if turn > 0:
-            assert bench.loop.snapshot.t == pytest.approx(looked[-2], abs=BYTE / 10)
 
 
 def test_a_position_is_dated_in_the_middle_of_the_units_pause(bench):
@@ -341,16 +307,20 @@ def test_the_newest_move_wins_and_moves_without_end_leave_the_line_to_polls(benc
     assert min(bench.unit.heard.count(order) for order in ("PP", "TP")) >= 40
 
 
-def test_a_refused_move_is_halted_and_its_error_raised_once(bench):
-    bench.start()
-    bench.unit.scripted = {"PP100": [b"! Maximum allowable Pan position is 90\r\n"]}
-    bench.move(100, 100)
-    bench.run(0.2)
-    assert bench.orders()[-2:] == ["PP100", "H"]
-    assert "Maximum allowable Pan position is 90" in str(bench.loop.errors.popleft())
-    move = bench.move(80, 100)
-    bench.until(move.done.is_set)
-    assert move.error is None
+@pytest.mark.parametrize(
+    ("config", "goals"),
+    [
+        # Positive pan of a PTU-D46 turns left, says its manual; that of a rig turns right. Tilt goes up for both.
+        (D46Settings(port="PORT"), (-10, 20)),
+        (D46Settings(port="PORT", pan_sign=1), (10, 20)),
+        (D46Settings(port="PORT", tilt_sign=-1, tilt_deg=(-31.1, 46.6)), (-10, -20)),
+    ],
+)
+def test_signs_turn_axes_round(opened, config, goals):
+    with contextlib.closing(D46Head(config, opened.clock)) as head:
+        head.move(10 * STEP, 19.6 * STEP, wait=True)
+        assert head.state().tilt == pytest.approx(20 * STEP)
+    assert opened.unit.goals() == goals
 
 
 def test_a_driver_that_slept_does_not_take_a_head_that_has_arrived_for_late(bench):
@@ -422,18 +392,30 @@ def test_a_halt_between_the_orders_of_a_move(bench):
     assert bench.orders() == ["PS1000", "TS1000", "PP1000", "H"]
 
 
-@pytest.mark.parametrize("last", [False, True])
-def test_a_byte_of_noise_at_the_unit_does_not_keep_it_from_a_halt(bench, last):
+@pytest.mark.parametrize("when", ["opened", "halted", "closed"])
+def test_a_byte_of_noise_at_the_unit_does_not_keep_it_from_a_halt(bench, when):
     """It hears "xH", or with a delimiter in front of the halt "x" and "H"."""
-    turning(bench)
     bench.unit.scripted = {noise: [b"! Illegal argument\r\n"] for noise in ("x", "xH")}
-    bench.unit.noise = b"x"
-    if last:
-        bench.loop.stop_for_good(DeviceError("closed"))
-        assert bench.loop.rests
+    if when == "opened":
+        bench.unit.way["P"] = (bench.clock.now(), 0, 3000)  # it was left turning
+        obey = bench.unit.obey
+
+        def noisy(order):
+            if order == "TA":  # the last question before the halt
+                bench.unit.noise = b"x"
+            return obey(order)
+
+        bench.unit.obey = noisy
+        bench.connect()
     else:
-        request = bench.halt()
-        bench.until(lambda: request.answered)
+        turning(bench)
+        bench.unit.noise = b"x"
+        if when == "halted":
+            request = bench.halt()
+            bench.until(lambda: request.answered)
+        else:
+            bench.loop.stop_for_good(DeviceError("closed"))
+            assert bench.loop.rests
     assert not bench.unit.turning()
 
 

@@ -7,7 +7,7 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.ptu_d46 import D46Head
 from cotarget.errors import DeviceError, EmergencyStopError
-from tests.support.d46_bench import CONFIG, Bench
+from tests.support.d46_peer import CONFIG, Bench
 
 SOON_S = 0.2  # from a stop to the halt on the wire; a hundredth of what the reset takes
 BOTH = b"!T!T!P!P"

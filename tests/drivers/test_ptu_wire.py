@@ -15,11 +15,12 @@ import pytest
 from cotarget.config import SafetyConfig
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import PositionLostMarker
-from cotarget.drivers.ptu_d46 import D46Head, D46Settings
+from cotarget.drivers.ptu_d46 import D46Head
 from cotarget.drivers.serial_line import InUseError
-from cotarget.emulators.ptu_d46.unit import D46_STOCK, E_SERIES
+from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.errors import DeviceError
-from tests.support.emulated_devices import DEADLINE_S, D46Unit
+from tests.support.emulated_devices import D46Unit
+from tests.support.plants import DEADLINE_S, fails, wait_for
 
 pytestmark = pytest.mark.wire
 STEP = math.radians(D46_STOCK.step / 3600)
@@ -32,27 +33,6 @@ LOADED_S = 2.0  # the same on a machine that does something else meanwhile: it d
 def opened(unit):
     with contextlib.closing(D46Head(unit.config, MonotonicClock())) as head:
         yield head
-
-
-def until(there, seconds=DEADLINE_S):
-    """Wait until something is so; how long that took [s]."""
-    start = time.monotonic()
-    while not there():
-        assert time.monotonic() < start + seconds
-        time.sleep(0.001)
-    return time.monotonic() - start
-
-
-def fails(call):
-    """What a call says when it fails at last."""
-    end = time.monotonic() + DEADLINE_S
-    while time.monotonic() < end:
-        try:
-            call()
-        except DeviceError as error:
-            return str(error)
-        time.sleep(0.001)
-    raise AssertionError("it goes on and on")
 
 
 @pytest.fixture(autouse=True)
@@ -68,28 +48,14 @@ def stock():
         yield unit
 
 
-def test_a_finer_unit_goes_where_it_is_sent():
-    with D46Unit(E_SERIES) as unit, opened(unit) as head:
-        step = head.limits.step
-        head.move(400 * step, -200 * step, wait=True)
-        assert (unit.pan.position(), unit.tilt.position()) == (400, -200)
-        assert not unit.turning()
-
-
-@pytest.mark.parametrize("by", ["closing", "the end of the program"])
-def test_it_is_stopped_by(stock, by):
-    if by == "closing":
-        with opened(stock) as head:
-            head.move(2.5, 0.0, speed=0.5)
-            until(stock.turning)
-    else:
-        program = (
-            "from cotarget.drivers.clock import MonotonicClock; from cotarget.drivers.ptu_d46 import D46Head\n"
-            "from cotarget.drivers.ptu_d46 import D46Settings\n"
-            f"D46Head(D46Settings(port='{stock.config.port}'), MonotonicClock()).move(2.5, 0.0, speed=0.5)"
-        )
-        subprocess.run([sys.executable, "-c", program], check=True, timeout=DEADLINE_S)
-    until(lambda: not stock.turning())
+def test_a_program_that_ends_stops_it(stock):
+    program = (
+        "from cotarget.drivers.clock import MonotonicClock; from cotarget.drivers.ptu_d46 import D46Head\n"
+        "from cotarget.drivers.ptu_d46 import D46Settings\n"
+        f"D46Head(D46Settings(port='{stock.config.port}'), MonotonicClock()).move(2.5, 0.0, speed=0.5)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=DEADLINE_S)
+    wait_for(lambda: not stock.turning())
     assert stock.pan.position() * STEP < 2.0
 
 
@@ -108,7 +74,7 @@ FAULTS = {
 def test_each_fault_halts_the_head_and_is_named(stock, fault):
     with opened(stock) as head:
         head.move(2.5, 0.0, speed=0.5)
-        until(stock.turning)
+        wait_for(stock.turning)
         stock.faults.set(fault)
         said = fails(head.state)
         assert FAULTS[fault] in said
@@ -117,7 +83,7 @@ def test_each_fault_halts_the_head_and_is_named(stock, fault):
         if fault == "unplugged":  # no halt reaches it
             assert fails(head.halt) == fails(lambda: head.move(0.0, 0.0)) == said
             return
-        until(lambda: not stock.turning(), FROM_FAULT_TO_HALT + LOADED_S)
+        wait_for(lambda: not stock.turning(), FROM_FAULT_TO_HALT + LOADED_S)
         assert stock.pan.position() * STEP < 2.0
         assert FAULTS[fault] in fails(lambda: head.move(0.0, 0.0))
 
@@ -138,7 +104,7 @@ def test_short_faults_are_recovered_from(stock, fault):
             t = head.state().t
             time.sleep(0.05)
             stock.faults.set(fault, False)
-            until(lambda t=t: head.state().t > t + 0.1)
+            wait_for(lambda t=t: head.state().t > t + 0.1)
         head.move(100 * STEP, 0.0, wait=True)
         assert stock.pan.position() == 100
 
@@ -154,7 +120,7 @@ def test_a_power_cycle_ends_it_and_a_reset_mends_it(tmp_path):
         lost = PositionLostMarker(unit.config.port, None)
         lost.forget()
         again = lambda: D46Head(unit.config, MonotonicClock())  # noqa: E731
-        until(lambda: "is not calibrated" in fails(again))  # once it has started up
+        wait_for(lambda: "is not calibrated" in fails(again))  # once it has started up
         lost.note(said)
         done = D46Head.reset(unit.config, MonotonicClock(), SafetyConfig(), lambda: None)
         assert "pan {} to {}".format(*D46_STOCK.pan) in done
@@ -183,7 +149,7 @@ def test_a_stop_or_signal_ends_a_reset(stock, state_home, how, status):
     command = [sys.executable, "-m", "cotarget.cli", "reset-head", "--rig", rig, "--yes"]
     process = subprocess.Popen(command, env=os.environ | path, stderr=subprocess.PIPE, text=True)
     try:
-        until(stock.turning)
+        wait_for(stock.turning)
         if how == "stop":
             (state_home / "stop").touch()
         else:
@@ -202,41 +168,6 @@ def test_a_stop_or_signal_ends_a_reset(stock, state_home, how, status):
         lost.refuse()
 
 
-@pytest.mark.parametrize("tcp", [False, True])
-def test_a_probe_does_not_move_the_head(tcp):
-    with D46Unit(tcp=tcp) as unit:
-        assert "unit 0" in D46Head.probe(unit.config)
-        assert not unit.turning()
-
-
-def test_the_error_names_a_wrong_baud_rate(stock):
-    stock.config = replace(stock.config, baud=19200)
-    assert "19200 baud" in fails(lambda: D46Head(stock.config, MonotonicClock()))
-
-
 def test_two_programs_on_one_port(stock):
     with opened(stock), pytest.raises(InUseError):
         D46Head(stock.config, MonotonicClock())
-
-
-# Ports that are none, and a text of the error, which also names the port.
-NO_PORTS = {
-    "FOLDER": "cannot open",
-    "FOLDER/file": "cannot open",
-    "FOLDER/missing": "serial ports here:",
-    "socket://127.0.0.1:1": "cannot connect",
-    "socket://no.such.host.invalid:4000": "cannot connect",
-    "socket://127.0.0.1": "hardware.head.port: .*write socket://HOST:PORT",
-    "socket://127.0.0.1:": "hardware.head.port: .*write socket://HOST:PORT",
-    "socket://terminal:four": "hardware.head.port: .*write socket://HOST:PORT",
-    "sockt://a:1": "invalid URL",
-}
-
-
-@pytest.mark.parametrize("port", NO_PORTS)
-def test_an_invalid_port_is_an_error_that_names_it(tmp_path, port):
-    said, port = NO_PORTS[port], port.replace("FOLDER", str(tmp_path))
-    (tmp_path / "file").touch()
-    with pytest.raises(DeviceError, match=said) as caught:
-        D46Head(D46Settings(port=port), MonotonicClock())
-    assert port in str(caught.value)

@@ -13,6 +13,7 @@ from cotarget.emulators.plant import Feed, Picture
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.emulators.serve import UnitPorts
+from cotarget.errors import DeviceError
 from cotarget.sim.motion import Axis
 
 DEADLINE_S = 20.0  # of real time: a loaded machine has reached it only if something hangs
@@ -148,9 +149,21 @@ def decoded(jpeg):
     return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
 
 
-def wait_for(condition):
+def wait_for(condition, seconds=DEADLINE_S):
     """Wait for something that another thread does."""
-    deadline = time.monotonic() + DEADLINE_S
+    deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "hangs"
         time.sleep(1e-3)
+
+
+def fails(call):
+    """What a call says when it fails at last."""
+    deadline = time.monotonic() + DEADLINE_S
+    while time.monotonic() < deadline:
+        try:
+            call()
+        except DeviceError as error:
+            return str(error)
+        time.sleep(1e-3)
+    raise AssertionError("it goes on and on")
