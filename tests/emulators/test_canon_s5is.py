@@ -15,7 +15,7 @@ from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isCamera, S5isServer, S
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed
 from cotarget.errors import DeviceError
-from tests.support.plants import DEADLINE_S, Film, LensModel, decoded, plain, publish
+from tests.support.plants import DEADLINE_S, LensModel, decoded, plain, publish, wait_for
 
 OK, BUSY = 0x2001, 0x2019
 ZOOM, EVENT_MODE = 0xD02A, 0xD045
@@ -180,13 +180,6 @@ def test_operations(shooting, operations, commands):
         assert bench.lens.commands == commands
 
 
-def test_the_zoom_reads_back_as_commanded():
-    with Bench() as bench:
-        for position in (105, 134):
-            bench.set(ZOOM, position)
-            assert bench.get(ZOOM) == position
-
-
 def test_every_announced_property_can_be_read():
     with Bench() as bench:
         for prop in announced(bench.ask(0x1001))[3]:
@@ -241,17 +234,6 @@ def test_the_viewfinder_gives_each_picture_once(monkeypatch):
         np.testing.assert_allclose(decoded(bench.ask(0x901D)), 40, atol=GREY)
 
 
-def test_the_viewfinder_waits_for_the_next_picture():
-    with Bench() as bench:
-        bench.ask(0x900B)
-        found = []
-        asking = threading.Thread(target=lambda: found.append(bench.answer(0x901D)))
-        asking.start()
-        show(bench.preview, 60, 0)
-        asking.join(DEADLINE_S)
-        np.testing.assert_allclose(decoded(found[0].data), 60, atol=GREY)
-
-
 def half_red(size):
     image = plain(size, 0)
     image[:, : size[0] // 2] = (0, 0, 255)
@@ -269,21 +251,11 @@ def test_a_still():
         assert (storage, kind, length) == (0x80000001, 0x3801, len(jpeg))
         assert struct.unpack_from("<II", info, 26) == (640, 480)
         assert struct.unpack_from("<I", info, 38) == (0,)  # in no folder
-        image = decoded(jpeg)
-        assert image.shape == (480, 640, 3)
-        np.testing.assert_allclose(image[240, 100], (0, 0, 255), atol=5)
-        np.testing.assert_allclose(image[240, 540], 0, atol=5)
+        np.testing.assert_allclose(decoded(jpeg)[240, 100], (0, 0, 255), atol=5)
         assert bench.code(0x1009, handle + 1) == bench.code(0x1008, 0) == 0x2009
-
-
-def test_the_next_still_replaces_the_last():
-    with Bench() as bench:
-        handles = []
-        for _ in range(2):
-            bench.ask(0x901A)
-            handles.append(bench.events_when(2)[0][1][0])
-        assert handles[0] != handles[1]
-        assert [bench.code(0x1009, handle) for handle in handles] == [0x2009, OK]
+        bench.ask(0x901A)
+        (_, (later,)), _ = bench.events_when(2)
+        assert [bench.code(0x1009, each) for each in (handle, later)] == [0x2009, OK]  # it takes the first one's place
 
 
 def test_the_camera_and_its_viewfinder_are_busy_during_a_still():
@@ -356,20 +328,6 @@ def test_a_still_is_lost_at_power_off():
         assert [code for code, _ in bench.events_when(2)] == [0xC009, 0x400D]
 
 
-def test_the_exposure_follows_the_request_after_the_delay():
-    opened = []
-
-    def still():
-        opened.append(time.monotonic())
-        return plain(SIZE, 50)
-
-    with Bench(still=still, shutter_s=0.1) as bench:
-        asked = time.monotonic()
-        bench.ask(0x901A)
-        bench.events_when(2)
-        assert opened[0] - asked >= 0.1
-
-
 def test_a_new_session_has_no_old_events_and_no_viewfinder(monkeypatch):
     monkeypatch.setattr(canon_s5is, "PICTURE_WAIT_S", 0.05)
     stills = Stills(1)
@@ -404,58 +362,42 @@ def test_a_busy_camera_refuses_commands_and_answers_queries():
         assert bench.set(ZOOM, 5) == OK
 
 
-# On the wire
+# On the wire: what libgphoto2 does not show in the tests of its driver
 @pytest.fixture
 def server():
     """An emulated camera with its lens as an attribute; no thread may be left of it."""
     before, lens = set(threading.enumerate()), LensModel()
-    with (
-        Film(lambda index: plain(SIZE, index % 200), 0.02) as film,
-        S5isServer(film.feed, lambda: half_red((640, 480)), lens, shutter_s=0.0) as server,
-    ):
+    with S5isServer(Feed(), lambda: half_red((640, 480)), lens, shutter_s=0.0) as server:
         server.lens = lens
         yield server
     assert set(threading.enumerate()) <= before
 
 
 class Line:
-    """A connection of an initiator."""
+    """A connection of an initiator, on which the first bytes have been sent; a context manager."""
 
     def __init__(self, port, first):
         self.socket = socket.create_connection(("127.0.0.1", port), DEADLINE_S)
-        self.send(first)
-
-    def send(self, data):
-        self.socket.sendall(data)
-
-    def exactly(self, count):
-        data = b""
-        while len(data) < count:
-            piece = self.socket.recv(count - len(data))
-            if not piece:
-                raise EOFError
-            data += piece
-        return data
+        self.socket.sendall(first)
+        self._stream = self.socket.makefile("rb")
 
     def packet(self):
-        length, kind = struct.unpack("<II", self.exactly(8))
-        return kind, self.exactly(length - 8)
+        """Kind and body of the next packet."""
+        length, kind = struct.unpack("<II", self._stream.read(8))
+        return kind, self._stream.read(length - 8)
 
     def ends(self):
         """Whether the other side has closed, after whatever it sent."""
         with contextlib.suppress(ConnectionError):
-            while self.socket.recv(1 << 16):
-                pass
+            self._stream.read()
         return True
-
-    def close(self):
-        self.socket.close()
 
     def __enter__(self):
         return self
 
     def __exit__(self, *_):
-        self.close()
+        self._stream.close()
+        self.socket.close()
 
 
 INIT_COMMAND = bytes.fromhex("20000000 01000000") + bytes(16) + bytes.fromhex("6100 0000 0000 0100")
@@ -464,41 +406,34 @@ INIT_COMMAND = bytes.fromhex("20000000 01000000") + bytes(16) + bytes.fromhex("6
 class Initiator(Line):
     """A command connection in an open session."""
 
-    def __init__(self, port, session=True):
+    def __init__(self, port):
         super().__init__(port, INIT_COMMAND)
         kind, body = self.packet()
         assert kind == 2, f"refused: {kind}"
         self.number = struct.unpack_from("<I", body)[0]
         self._transaction = 0
-        if session:
-            assert self.ask(0x1002, 1)[0] == OK
+        assert self.ask(0x1002, 1)[0] == OK
 
     def request(self, code, *parameters, data=None):
         self._transaction += 1
         phase = 1 if data is None else 2
         body = struct.pack(f"<IHI{len(parameters)}I", phase, code, self._transaction, *parameters)
-        self.send(struct.pack("<II", 8 + len(body), 6) + body)
+        self.socket.sendall(struct.pack("<II", 8 + len(body), 6) + body)
         if data is not None:
-            self.send(struct.pack("<IIIQ", 20, 9, self._transaction, len(data)))
-            self.send(struct.pack("<III", 12 + len(data), 12, self._transaction) + data)
+            self.socket.sendall(struct.pack("<IIIQ", 20, 9, self._transaction, len(data)))
+            self.socket.sendall(struct.pack("<III", 12 + len(data), 12, self._transaction) + data)
 
     def ask(self, code, *parameters, data=None):
-        self.request(code, *parameters, data=data)
-        return self.answer()
-
-    def answer(self):
         """(response code, data)."""
-        data = b""
-        while True:
-            kind, body = self.packet()
-            if kind == 7:
-                assert struct.unpack_from("<I", body, 2)[0] == self._transaction
-                return struct.unpack_from("<H", body)[0], data
-            if kind in (10, 12):
-                data += body[4:]
+        self.request(code, *parameters, data=data)
+        answer = b""
+        while (packet := self.packet())[0] != 7:
+            answer += packet[1][4:] if packet[0] in (10, 12) else b""
+        assert struct.unpack_from("<I", packet[1], 2)[0] == self._transaction
+        return struct.unpack_from("<H", packet[1])[0], answer
 
-    def shoot(self):
-        assert self.ask(0x1016, EVENT_MODE, data=b"\x07\0")[0] == OK
+    def shoot(self, mode=7):
+        assert self.ask(0x1016, EVENT_MODE, data=bytes([mode, 0]))[0] == OK
         assert self.ask(0x9008)[0] in (OK, 0xA009)
 
     def zoom(self, position):
@@ -509,44 +444,30 @@ def listen_to(port, number):
     return Line(port, struct.pack("<III", 12, 3, number))
 
 
-def reconnected(port):
-    """A new session, as soon as the port is open again."""
-    deadline = time.monotonic() + DEADLINE_S
-    while True:
-        try:
-            return Initiator(port)
-        except (OSError, EOFError):
-            assert time.monotonic() < deadline
+def listens(port):
+    with contextlib.suppress(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), DEADLINE_S).close()
+        return True
+    return False
 
 
 @pytest.mark.wire
-def test_a_session_on_the_wire(server):
+def test_a_still_interrupts_on_the_event_connection(server):
     with Initiator(server.port) as camera, listen_to(server.port, camera.number) as events:
         assert events.packet() == (4, b"")
-        camera.shoot()
-        assert camera.zoom(105) == OK
-        assert server.lens.position() == 105
-        assert camera.zoom(135) == 0x201C
-        assert camera.ask(0x900B)[0] == OK
-        for _ in range(3):
-            code, jpeg = camera.ask(0x901D)
-            assert (code, decoded(jpeg).shape) == (OK, (240, 320, 3))
-        events.send(bytes.fromhex("08000000 0d000000"))
+        events.socket.sendall(bytes.fromhex("08000000 0d000000"))
         assert events.packet() == (14, b"")
-
-
-@pytest.mark.wire
-def test_a_still_on_the_wire_interrupts(server):
-    with Initiator(server.port) as camera, listen_to(server.port, camera.number) as events:
-        assert events.packet() == (4, b"")
-        camera.shoot()
-        assert camera.ask(0x1016, EVENT_MODE, data=b"\x04\0")[0] == OK
+        camera.shoot(mode=1)
+        assert events.packet()[1][:2] == b"\x0c\xc0"
         assert camera.ask(0x901A)[0] == OK
         kind, body = events.packet()
         code, _, handle = struct.unpack("<HII", body)
         assert (kind, code) == (8, 0xC009)
         assert events.packet()[1][:2] == b"\x0d\x40"
         assert decoded(camera.ask(0x1009, handle)[1]).shape == (480, 640, 3)
+        with listen_to(server.port, camera.number + 1) as stranger:
+            assert stranger.packet() == (5, struct.pack("<I", 1))
+            assert stranger.ends()
 
 
 @pytest.mark.wire
@@ -557,68 +478,47 @@ def test_one_initiator_at_a_time(server, monkeypatch):
             assert second.packet() == (5, struct.pack("<I", 2))
             assert second.ends()
     monkeypatch.undo()
-    for _ in range(20):  # a client may reconnect at once
+    for _ in range(5):  # a client may reconnect at once
         with Initiator(server.port) as camera:
             camera.shoot()
 
 
 @pytest.mark.wire
-def test_events_belong_to_a_command_connection(server):
-    with Initiator(server.port) as camera, listen_to(server.port, camera.number + 1) as stranger:
-        assert stranger.packet() == (5, struct.pack("<I", 1))
-        assert stranger.ends()
-        assert camera.ask(0x1001)[0] == OK
-
-
-@pytest.mark.wire
-@pytest.mark.parametrize(
-    "noise", [b"GET / HTTP/1.0\r\n\r\n", bytes(8), b"\xff" * 64, bytes.fromhex("08000000 0d000000")]
-)
+@pytest.mark.parametrize("noise", [b"GET / HTTP/1.0\r\n\r\n", bytes(8), bytes.fromhex("08000000 0d000000")])
 def test_noise_ends_its_own_connection_only(server, noise):
     with Initiator(server.port) as camera, Line(server.port, noise) as stranger:
         assert stranger.ends()
         assert camera.ask(0x1001)[0] == OK
-        camera.send(noise if len(noise) > 8 else bytes(8))
+        camera.socket.sendall(bytes(8))
         assert camera.ends()
-    Initiator(server.port).close()
 
 
 @pytest.mark.wire
-def test_a_hung_camera_neither_acts_nor_answers(server):
+def test_faults_of_the_line(server):
     with Initiator(server.port) as camera:
         camera.shoot()
+        server.faults.set("slow")
+        began = time.monotonic()
+        assert camera.zoom(6) == OK
+        assert time.monotonic() - began >= ptpip.SLOW_S
+        assert ptpip.SLOW_S < REPLY_S / 2
+        server.faults.set("slow", False)
         server.faults.set("hung")
         camera.request(0x1016, ZOOM, data=b"\x05\0")
         camera.socket.settimeout(0.3)
         with pytest.raises(TimeoutError):
-            camera.packet()
+            camera.socket.recv(1)
         camera.socket.settimeout(DEADLINE_S)
         server.faults.set("hung", False)
         assert camera.zoom(7) == OK
-        assert server.lens.commands == [7]
-
-
-@pytest.mark.wire
-def test_a_slow_camera_answers_before_libgphoto2_gives_up(server):
-    with Initiator(server.port) as camera:
-        server.faults.set("slow")
-        began = time.monotonic()
-        assert camera.ask(0x1003)[0] == OK
-        assert time.monotonic() - began >= ptpip.SLOW_S
-        assert ptpip.SLOW_S < REPLY_S / 2
-
-
-@pytest.mark.wire
-def test_data_is_cut_once(server):
-    with Initiator(server.port) as camera:
+        assert server.lens.commands == [6, 7]
         server.faults.set("cut")
-        assert camera.ask(0x1002, 1)[0] == 0x201E  # brings no data
+        assert camera.zoom(8) == OK  # brings no data
         camera.request(0x1001)
         assert camera.packet()[0] == 9
-        with pytest.raises(EOFError):
-            camera.packet()
+        assert camera.ends()
     with Initiator(server.port) as camera:
-        assert camera.ask(0x1001)[0] == OK
+        assert camera.ask(0x1001)[0] == OK  # it happens once
 
 
 @pytest.mark.wire
@@ -632,40 +532,29 @@ def test_an_absent_camera_comes_back_in_play_mode(server, fault, zoom):
         server.faults.set(fault)
         assert camera.ends()
         assert events.ends()
-    with pytest.raises(OSError, match="refused"):
-        socket.create_connection(("127.0.0.1", server.port), DEADLINE_S)
+    assert not listens(server.port)
     assert server.lens.position() == zoom
     server.faults.set(fault, False)
-    with reconnected(server.port) as camera:
+    wait_for(lambda: listens(server.port))
+    with Initiator(server.port) as camera:
         assert camera.ask(0x1015, ZOOM)[0] == 0x200A
         camera.shoot()
         assert camera.ask(0x1015, ZOOM) == (OK, struct.pack("<H", zoom))
 
 
 @pytest.mark.wire
-def test_the_server_closes_during_a_still_and_a_slow_answer(server):
-    with Initiator(server.port) as camera, listen_to(server.port, camera.number) as events, Line(server.port, b""):
-        assert events.packet() == (4, b"")
-        camera.shoot()
-        camera.request(0x901A)
-        server.faults.set("slow")
-        camera.request(0x1001)
-        began = time.monotonic()
-        server.close()
-        assert time.monotonic() - began < DEADLINE_S
-        assert camera.ends()
-
-
-@pytest.mark.wire
-def test_closing_waits_for_a_still():
+def test_closing_waits_for_a_still_and_not_for_a_slow_answer():
     stills, before = Stills(1), set(threading.enumerate())
     with S5isServer(Feed(), stills, LensModel(), shutter_s=0.0) as server, Initiator(server.port) as camera:
         camera.shoot()
         assert camera.ask(0x901A)[0] == OK
         assert stills.begun[0].wait(DEADLINE_S)
+        server.faults.set("slow")
+        camera.request(0x1001)
         letting = threading.Timer(0.1, stills.let[0].set)
         letting.start()
         server.close()
+        assert camera.ends()
         assert set(threading.enumerate()) - before <= {letting}
         letting.join(DEADLINE_S)
 

@@ -8,8 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cotarget.emulators import ptpip
-from cotarget.emulators.canon_s5is import OPERATIONS, S5IS_FAULTS, Exposure, S5isCamera
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptpip import (
     Code,
     CommandSession,
@@ -22,7 +20,6 @@ from cotarget.emulators.ptpip import (
     response,
     split,
 )
-from tests.support.plants import LensModel
 
 PROPERTY = settings(derandomize=True, database=None, deadline=None, max_examples=500)
 GUID = bytes(range(16))
@@ -220,63 +217,3 @@ def test_packets_malformed_or_out_of_turn(packets):
         assert session.receive(kind, body) == []
     with pytest.raises(PtpError):
         session.receive(*packets[-1])
-
-
-def test_a_hung_device_does_and_answers_nothing():
-    device = Echo()
-    assert CommandSession(device, lambda: True).receive(*request(0x1001, 1)) == []
-    assert device.asked == []
-
-
-class Instant:
-    """Viewfinder and shutter that need no time."""
-
-    on = False
-
-    def switch(self, on):
-        self.on = on
-
-    def image(self):
-        return b"jpeg" if self.on else None
-
-    def release(self, done):
-        done(Exposure(b"JPEG", (4, 3)))
-
-
-WORDS = st.sampled_from([0, 1, 0xD02A, 0xD045, 0xD006, 0xD402, 0x81000001]) | st.integers(0, (1 << 32) - 1)
-OPERATION = st.tuples(
-    st.sampled_from(OPERATIONS) | st.integers(0, 0xFFFF),
-    st.lists(WORDS, max_size=5),
-    st.none() | st.sampled_from([b"\5\0", b""]) | st.binary(max_size=8),
-)
-CUT = st.tuples(st.integers(0, 120), st.integers(0, 8), st.binary(max_size=8))
-
-
-@given(
-    operations=st.lists(OPERATION, min_size=1, max_size=8),
-    cuts=st.one_of(st.just([]), st.lists(CUT, max_size=4)),
-    shooting=st.booleans(),
-)
-@PROPERTY
-def test_noise_is_refused_in_whole_packets(operations, cuts, shooting):
-    viewfinder = Instant()
-    camera = S5isCamera(viewfinder, viewfinder, LensModel(), Faults(S5IS_FAULTS), lambda code, parameters: None)
-    camera.operate(OPEN, (1, 0, 0, 0, 0), b"")
-    if shooting:
-        camera.operate(0x9008, (0,) * 5, b"")
-    sent = bytearray()
-    for number, (code, words, content) in enumerate(operations):
-        sent += packet(*request(code, number, *words, sends=content is not None))
-        sent += b"" if content is None else b"".join(data_phase(number, content))
-    for at, length, new in cuts:
-        sent[at : at + length] = new
-    session, answers = CommandSession(camera), []
-    try:
-        for kind, body in split([bytes(sent)]):
-            answers += [b"".join(session.receive(kind, body))]
-    except PtpError:
-        assert cuts
-    kinds = [kind for answer in answers for kind, _ in split([answer])]
-    assert set(kinds) <= {Kind.RESPONSE, Kind.START_DATA, Kind.DATA, Kind.END_DATA, Kind.PROBE_RESPONSE}
-    if not cuts:
-        assert kinds.count(Kind.RESPONSE) == len(operations)
