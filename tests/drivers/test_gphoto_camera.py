@@ -22,9 +22,9 @@ from cotarget.drivers.gphoto_camera import GphotoCamera, GphotoSettings, SharedS
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from tests.support.emulated_devices import s5is_process
 from tests.support.gphoto_link import CALL_S, CONFIG, PERIOD, PITCH_MM, SIZE, FakeLink, jpeg
+from tests.support.plants import DEADLINE_S, wait_for
 from tests.support.simulated_clock import SimClock
 
-DEADLINE_S = 20.0  # for whatever should happen at once: only a hang takes as long
 GREY = 2.0  # grey levels by which JPEG may change an even picture
 HELD_S = 2.0  # a thread that waits this long stood still while libgphoto2 waited 2.5 s for an answer
 BUSY, BAD, IO, TIMEOUT, CLAIM = -110, -2, -7, -10, -53  # libgphoto2's results
@@ -84,7 +84,6 @@ def test_opening_enters_shooting_before_it_looks_for_the_lens():
     bench = Bench()
     assert bench.camera.log[:2] == [("open",), ("put", "capture", 1)]
     assert bench.camera.values["capturetarget"] == "Internal RAM"
-    assert bench.zoom.lens.focal_range == pytest.approx((6.0 / PITCH_MM, 72.0 / PITCH_MM))
     assert bench.camera.commands("zoom") == []
     assert bench.newest().image.shape == (24, 32, 3)
 
@@ -114,24 +113,22 @@ def test_a_setting_that_the_camera_takes_otherwise_is_a_warning(caplog):
     assert "'owner' as 'NOBODY'" in said
 
 
-# What is wrong, and the key that the error begins with.
-SETTINGS = [
-    ({"isso": "80"}, "hardware.zoom.settings"),
-    ({"iso": "81"}, "hardware.zoom.settings.iso"),
-    ({"zoom": "135"}, "hardware.zoom.settings.zoom"),
-    ({"zoom": "wide"}, "hardware.zoom.settings.zoom"),
-    ({"capture": "yes"}, "hardware.zoom.settings.capture"),
-    ({"datetime": "now"}, "hardware.zoom.settings.datetime"),
-    ({"datetime": "1.5"}, "hardware.zoom.settings.datetime"),
-    ({"datetime": "99999999999"}, "hardware.zoom.settings.datetime"),
-]
-CAMERAS = [
-    ({"range": (0.0, 100.0, 1.0)}, "hardware.zoom.lens"),
-    ({"range": (3.0, 134.0, 1.0)}, "hardware.zoom.lens"),
-    ({"range": (0.0, 1000.0, 500.0)}, "hardware.zoom.lens"),
-    ({"readonly": {"zoom"}}, "hardware.zoom.zoom_key"),
-    ({"choices": {"zoom": ("wide", "tele")}}, "hardware.zoom.zoom_key"),
-    ({"preview_size": (40, 30)}, "hardware.zoom.size"),
+# Settings of the user, what the camera is like, and the key that the error begins with.
+REFUSED = [
+    ({"isso": "80"}, {}, "hardware.zoom.settings"),
+    ({"iso": "81"}, {}, "hardware.zoom.settings.iso"),
+    ({"iso": "80"}, {"readonly": {"iso"}}, "hardware.zoom.settings.iso"),
+    ({"zoom": "135"}, {}, "hardware.zoom.settings.zoom"),
+    ({"zoom": "wide"}, {}, "hardware.zoom.settings.zoom"),
+    ({"capture": "yes"}, {}, "hardware.zoom.settings.capture"),
+    ({"datetime": "1.5"}, {}, "hardware.zoom.settings.datetime"),
+    ({"datetime": "99999999999"}, {}, "hardware.zoom.settings.datetime"),
+    ({}, {"range": (0.0, 100.0, 1.0)}, "hardware.zoom.lens"),
+    ({}, {"range": (3.0, 134.0, 1.0)}, "hardware.zoom.lens"),
+    ({}, {"range": (0.0, 1000.0, 500.0)}, "hardware.zoom.lens"),
+    ({}, {"readonly": {"zoom"}}, "hardware.zoom.zoom_key"),
+    ({}, {"choices": {"zoom": ("wide", "tele")}}, "hardware.zoom.zoom_key"),
+    ({}, {"preview_size": (40, 30)}, "hardware.zoom.size"),
 ]
 
 
@@ -145,19 +142,9 @@ def refused(kind, config=CONFIG, prepare=lambda camera: None):
     return str(error.value)
 
 
-@pytest.mark.parametrize(("settings", "key"), SETTINGS)
-def test_wrong_settings_are_named(settings, key):
-    assert refused(ConfigError, replace(CONFIG, settings=settings)).startswith(f"{key}: ")
-
-
-def test_a_setting_that_can_only_be_read_is_named():
-    config = replace(CONFIG, settings={"iso": "80"})
-    assert refused(ConfigError, config, changed(readonly={"iso"})).startswith("hardware.zoom.settings.iso: ")
-
-
-@pytest.mark.parametrize(("changes", "key"), CAMERAS)
-def test_cameras_that_are_not_as_configured_are_named(changes, key):
-    assert refused(ConfigError, prepare=changed(**changes)).startswith(f"{key}: ")
+@pytest.mark.parametrize(("settings", "changes", "key"), REFUSED)
+def test_wrong_settings_and_cameras_are_named(settings, changes, key):
+    assert refused(ConfigError, replace(CONFIG, settings=settings), changed(**changes)).startswith(f"{key}: ")
 
 
 def test_a_camera_without_zoom_says_which_settings_it_has():
@@ -318,14 +305,6 @@ def test_the_lens_is_sent_at_once_read_back_and_moves_as_estimated():
     assert bench.shared.motion.position(start + 0.55) == pytest.approx(30.0)
 
 
-def test_the_latest_command_wins():
-    bench = Bench()
-    for position in (10, 20, 30):
-        bench.send(position)
-    bench.run(0.5)
-    assert bench.camera.commands("zoom") == [30.0]
-
-
 # Fault of the lens: what the camera does, whether the lens arrives, and how often it is sent there.
 LENS_FAULTS = {
     "busy": ({"fail": {"put": [BUSY] * 20}}, True, 21),
@@ -481,15 +460,6 @@ def opened(config=CONFIG, prepare=lambda camera: None):
         assert not link.connected
 
 
-def wait_for(condition):
-    """Wait for what happens at once, without a notice."""
-    clock = MonotonicClock()
-    deadline = clock.now() + DEADLINE_S
-    while not condition():
-        assert clock.now() < deadline
-        clock.sleep_until(clock.now() + 0.002)
-
-
 def trouble(call):
     """What a call's error says; empty if there is none."""
     try:
@@ -568,33 +538,6 @@ def test_after_a_still_fault_the_next_still_is_taken(monkeypatch, name):
         assert camera.capture().image.shape == (48, 64, 3)
 
 
-def test_reading_waits_while_a_still_is_taken():
-    release, shooting = threading.Event(), threading.Event()
-
-    def prepare(camera):
-        shoot = camera.shoot
-
-        def held():
-            shooting.set()
-            assert release.wait(DEADLINE_S)
-            return shoot()
-
-        camera.shoot = held
-
-    with opened(prepare=prepare) as (camera, link):
-        taker = threading.Thread(target=camera.capture, daemon=True)
-        taker.start()
-        assert shooting.wait(DEADLINE_S)
-        now = link.clock.now()
-        with pytest.raises(StaleFrameError):
-            camera.read(now, 0.02)
-        assert camera.zoom(1000.0) > 0  # returns at once all the same
-        release.set()
-        assert camera.read(now - CONFIG.latency_s, DEADLINE_S).t > now - CONFIG.latency_s
-        taker.join(DEADLINE_S)
-        assert not taker.is_alive()
-
-
 def test_a_camera_that_is_gone_raises_at_every_call(monkeypatch):
     monkeypatch.setattr("cotarget.drivers.gphoto_camera.RECONNECT_S", 0.0)
     with opened() as (camera, link):
@@ -655,14 +598,11 @@ def emulated(process, tmp_path, monkeypatch):
     assert [path.name for path in home.rglob("*")] == [".config"]
 
 
-def frame_after(camera, t):
-    """A frame newer than a time, however often the camera must be found again until then."""
-    clock = MonotonicClock()
-    deadline = clock.now() + DEADLINE_S
-    while clock.now() < deadline:
-        with contextlib.suppress(StaleFrameError):
-            return camera.read(t, 1.0)
-    raise AssertionError("no frame")
+def newer(camera, t):
+    """Whether there is a frame newer than a time; the camera may have to be found again until then."""
+    with contextlib.suppress(StaleFrameError):
+        return camera.read(t, 1.0).t > t
+    return False
 
 
 @pytest.mark.wire
@@ -676,7 +616,8 @@ def test_an_emulated_camera_goes_on_after_a_fault(emulated, process, fault):
     with pytest.raises(StaleFrameError):
         emulated.read(MonotonicClock().now(), 0.3)
     process.switch(fault, on=False)
-    frame_after(emulated, MonotonicClock().now())
+    now = MonotonicClock().now()
+    wait_for(lambda: newer(emulated, now))
     wait_for(lambda: not emulated.state().moving)
     assert emulated.state().focal_px == emulated_goal
     assert process.lens() == 105
@@ -705,7 +646,7 @@ def test_a_hung_camera_stops_no_other_thread_and_is_found_again(emulated, proces
         done.set()
         ticker.join(DEADLINE_S)
     assert max(gaps) < HELD_S
-    assert frame_after(emulated, leaving).t > leaving
+    wait_for(lambda: newer(emulated, leaving))
 
 
 @pytest.mark.wire

@@ -24,7 +24,7 @@ USER, PASSWORD = "root", "hunter2 & co"
 
 
 @contextlib.contextmanager
-def axis_server():
+def axis_server(auth="digest"):
     """A 241Q whose input shows a new picture 25 times a second, which has noise like a camera's."""
     rng = np.random.default_rng(0)
     scene = cv2.resize(rng.integers(0, 255, (15, 20, 3), dtype=np.uint8), FEED_SIZE, interpolation=cv2.INTER_CUBIC)
@@ -32,7 +32,7 @@ def axis_server():
     def draw(index):
         return cv2.add(scene, rng.integers(0, 5, scene.shape, dtype=np.uint8))
 
-    with Film(draw) as film, AxisServer({1: film.feed}, user=USER, password=PASSWORD) as server:
+    with Film(draw) as film, AxisServer({1: film.feed}, user=USER, password=PASSWORD, auth=auth) as server:
         yield server
 
 
