@@ -128,18 +128,6 @@ def test_a_picture_without_one_of_its_restart_markers_or_its_last_scans_is_refus
     assert not accepted(jpeg[: (scan(jpeg) + len(jpeg)) // 2] + jpeg[-2:])
 
 
-def test_pictures_without_huffman_tables_have_the_usual_ones():
-    """As many MJPEG cameras send them (AVI1): the tables are those of T.81, annex K."""
-    jpeg = picture((64, 48), 0)
-    bare, at = jpeg[:2], 2
-    while jpeg[at + 1] != 0xDA:
-        end = at + 2 + int.from_bytes(jpeg[at + 2 : at + 4])
-        bare, at = bare + (b"" if jpeg[at + 1] == 0xC4 else jpeg[at:end]), end
-    bare += jpeg[at:]
-    assert len(bare) < len(jpeg) - 400  # four tables of 420 bytes are gone
-    np.testing.assert_array_equal(decode_jpeg(bare), opencv(jpeg))
-
-
 def test_a_header_that_asks_for_gigabytes_is_refused():
     jpeg = picture((64, 48), 0)
     at = jpeg.index(b"\xff\xc0") + 5

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
+from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.errors import DeviceError
 
 USB = "/dev/serial/by-id/usb-FTDI_FT232R-if00"
@@ -25,20 +25,6 @@ def refused(lost):
     except DeviceError as error:
         return str(error)
     return ""
-
-
-def test_a_rig_remembers_until_its_head_was_reset(stop_file):
-    lost = PositionLostMarker(USB, stop_file)
-    assert not refused(lost)
-    lost.note(str(PositionLostError(USB, "fell off the roof")))
-    assert lost.file.name == "stop.dev-serial-by-id-usb-FTDI-FT232R-if00.position-lost"
-    said = refused(lost)
-    assert said.startswith(f"the pan-tilt unit at {USB} fell off the roof")
-    assert "cotarget reset-head" in said
-    assert str(lost.file) in said
-    for _ in range(2):
-        lost.forget()
-        assert not refused(lost)
 
 
 # Where a marker was noted, where it is asked for, and whether it counts there: port and name of the stop file.
@@ -84,13 +70,6 @@ def test_a_marker_that_cannot_be_read_refuses_too(stop_file):
     lost = PositionLostMarker(USB, stop_file)
     lost.file.mkdir(parents=True)
     assert "cotarget reset-head" in refused(lost)
-
-
-def test_the_stop_file_itself_is_no_lost_position(stop_file):
-    stop_file.parent.mkdir()
-    stop_file.touch()
-    stop_file.with_name("stop.old").touch()
-    assert not refused(PositionLostMarker(USB, stop_file))
 
 
 def test_a_marker_that_cannot_be_written_or_read_is_reported(tmp_path, caplog):

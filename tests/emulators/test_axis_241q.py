@@ -8,24 +8,18 @@ from dataclasses import replace
 from email.message import Message
 
 import cv2
-import httpx
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 
-from cotarget.emulators import axis_241q
 from cotarget.emulators.axis_241q import (
     Authenticator,
     AxisServer,
     HttpError,
     Pace,
-    damaged,
     list_parameters,
     parse_options,
 )
 from cotarget.emulators.plant import Feed
-from cotarget.errors import DeviceError
 from tests.support.plants import DEADLINE_S, decoded, plain, publish, wait_for
 
 JPEG_LEVELS = 3.0  # JPEG's error in the mean of a flat picture [grey levels]
@@ -165,10 +159,6 @@ def test_only_the_basic_authorization_of_the_rfc_is_allowed():
         assert not allowed(guard, authorization)
 
 
-def test_without_a_user_everyone_is_allowed():
-    assert allowed(Authenticator("", "", "digest", "R", ""), "")
-
-
 @pytest.mark.parametrize(("source", "wanted"), [(25, 25), (25, 10), (25, 20), (30, 7), (10, 25)])
 def test_a_stream_is_thinned_to_its_rate(source, wanted):
     rng = np.random.default_rng(1)
@@ -179,11 +169,6 @@ def test_a_stream_is_thinned_to_its_rate(source, wanted):
     # What passes is at most a period and a frame late, and never two at a time.
     assert max(np.diff(passed)) < 1 / min(source, wanted) + 1.5 / source
     assert min(np.diff(passed)) > 0.5 / max(source, wanted)
-
-
-def test_without_a_rate_every_image_passes():
-    pace = Pace(0)
-    assert all(pace.due(t) for t in [0.0, 0.0, 0.1, 0.1])
 
 
 @pytest.mark.parametrize(
@@ -241,13 +226,6 @@ NOPE = "# Error: Error -1 getting param in group 'root.Nope'\n"
 def test_groups_of_parameters(arguments, answer):
     listed = {"root.Brand.Brand": "AXIS", "root.Brand.ProdNbr": "241Q", "root.Brandy.Age": "12"}
     assert list_parameters(listed, arguments) == answer
-
-
-def test_damage_keeps_the_length_and_hits_start_end_and_middle():
-    data = bytes(range(1, 101))
-    assert damaged(data, 0) == bytes(25) + data[25:]
-    assert damaged(data, 1) == data[:75] + bytes(25)
-    assert damaged(data, 2) == data[:50] + bytes(25) + data[75:]
 
 
 # Over loopback
@@ -315,17 +293,6 @@ def test_parameters_by_get_and_post(server, directory, form):
 
 
 @pytest.mark.wire
-def test_all_parameters(server):
-    everything = body(exchange(server, "/axis-cgi/param.cgi?action=list")).decode().splitlines()
-    assert {
-        "root.Properties.API.HTTP.Version=2",
-        "root.Image.I0.Appearance.Resolution=640x480",
-        "root.Image.I1.Appearance.Resolution=4CIF",
-        "root.Properties.System.SerialNumber=00408C000241",
-    } <= set(everything)
-
-
-@pytest.mark.wire
 @pytest.mark.parametrize(
     ("request_", "status"),
     [
@@ -353,23 +320,6 @@ def test_refusals(server, request_, status):
 
 
 @pytest.mark.wire
-def test_a_camera_without_any_picture_is_not_ready(monkeypatch):
-    monkeypatch.setattr(axis_241q, "FIRST_PICTURE_S", 0.1)
-    with AxisServer({1: Feed()}) as server:
-        assert exchange(server, SNAPSHOT).startswith(b"HTTP/1.0 503 Service Unavailable\r\n")
-
-
-@pytest.mark.wire
-@pytest.mark.parametrize(("auth", "client"), [("digest", httpx.DigestAuth), ("basic", httpx.BasicAuth)])
-def test_a_client_authenticates_itself(feed, auth, client):
-    with AxisServer({1: feed}, user="root", password="pa:ss", auth=auth) as server:
-        target = f"{server.url}{SNAPSHOT}?camera=1"
-        assert httpx.get(target).status_code == 401
-        assert httpx.get(target, auth=client("root", "pa:ss")).status_code == 200
-        assert httpx.get(target, auth=client("root", "pass")).status_code == 401
-
-
-@pytest.mark.wire
 def test_twenty_viewers_and_no_more(server, feed):
     viewers = [Viewer(server) for _ in range(20)]
     assert len({viewer.part() for viewer in viewers}) == 1
@@ -384,31 +334,6 @@ def test_twenty_viewers_and_no_more(server, feed):
 
 
 @pytest.mark.wire
-def test_a_slow_viewer_delays_no_other_and_gets_the_newest_image(server, feed):
-    rng = np.random.default_rng(0)
-    count = 60
-    slow = socket.socket()
-    slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    slow.settimeout(DEADLINE_S)
-    slow.connect((server.host, server.port))
-    slow.sendall(f"GET {STREAM}?compression=0 HTTP/1.0\r\n\r\n".encode())
-    with slow, slow.makefile("rb") as stream, Viewer(server, STREAM + "?compression=0") as quick:
-        assert stream.read(len(STREAM_HEAD)) == STREAM_HEAD
-        quick.part()
-        for index in range(1, count):  # half a megabyte each: more than the kernel holds for a viewer
-            publish(feed, index, rng.integers(0, 255, (480, 640, 3), np.uint8))
-            newest = quick.part()
-        # Of 60 pictures the slow viewer gets those that were under way, and then the newest at once.
-        parts, data = 0, b""
-        while data != newest:
-            head = b"".join(stream.readline() for _ in range(4))
-            data = stream.read(int(PART.fullmatch(head)[1]))
-            parts += 1
-            stream.read(2)
-        assert parts < count
-
-
-@pytest.mark.wire
 def test_the_time_of_each_parts_first_byte_is_reported(feed):
     noted = []
     with AxisServer({1: feed}, sent=lambda index, t: noted.append((index, t))) as server, Viewer(server) as viewer:
@@ -420,75 +345,6 @@ def test_the_time_of_each_parts_first_byte_is_reported(feed):
         after = time.monotonic()
     assert [index for index, _ in noted] == list(range(6))
     assert before <= noted[-1][1] <= after
-
-
-@pytest.mark.wire
-def test_a_stream_keeps_the_requested_rate(server, feed):
-    with Viewer(server, STREAM + "?fps=0.01") as viewer:
-        viewer.part()
-        viewer.connection.settimeout(0.3)
-        for index in range(1, 10):
-            show(feed, index)
-        with pytest.raises(TimeoutError):
-            viewer.connection.recv(1)
-
-
-@pytest.mark.wire
-def test_close_ends_streams_stalls_and_idle_clients_soon(feed):
-    server = AxisServer({1: feed})
-    with Viewer(server) as viewer, ask(server, b"") as idle:
-        viewer.part()
-        server.faults.set("stall")
-        with ask(server, SNAPSHOT) as stalled:
-            assert stalled.recv(10)
-            start = time.monotonic()
-            server.close()
-            server.close()
-            assert time.monotonic() - start < 5
-            assert viewer.stream.read() == b""
-            assert idle.recv(1) == b""
-    with pytest.raises(ConnectionRefusedError):
-        ask(server, b"")
-
-
-@pytest.mark.wire
-@pytest.mark.parametrize("port", [None, 99999])
-def test_an_address_in_use_or_out_of_range_is_named(server, port):
-    port = port or server.port
-    with pytest.raises(DeviceError, match=f"127.0.0.1:{port}"):
-        AxisServer({}, port=port)
-
-
-# Mutated requests: none may break the server, which has to answer the next one.
-SEEDS = [
-    b"GET /mjpg/video.mjpg?camera=1&resolution=4CIF&fps=25&nbrofframes=1 HTTP/1.0\r\nAuthorization: Basic QTpi\r\n\r\n",
-    b"POST /axis-cgi/param.cgi HTTP/1.1\r\nContent-Length: 28\r\nAuthorization: " + RFC_DIGEST.encode() + b"\r\n\r\n"
-    b"action=list&group=root.Brand",
-]
-CUTS = st.tuples(
-    st.integers(0, 400), st.integers(0, 3), st.sampled_from([b"", b"%", b"\r\n", b"&", b'"', b"[", b"nan", b"\xff"])
-)
-
-
-@pytest.fixture(scope="module")
-def guarded():
-    feed = Feed()
-    show(feed, 0)
-    with AxisServer({1: feed}, user="Mufasa", password="Circle Of Life") as server:
-        yield server
-
-
-@pytest.mark.wire
-@settings(derandomize=True, database=None, deadline=None, max_examples=200)
-@given(seed=st.sampled_from(SEEDS), cuts=st.lists(CUTS, max_size=6))
-@example(seed=SEEDS[0], cuts=[])
-def test_mutated_requests_are_refused(guarded, seed, cuts):
-    data = bytearray(seed)
-    for at, length, new in cuts:
-        data[at : at + length] = new
-    with ask(guarded, bytes(data)) as connection, connection.makefile("rb") as stream:
-        connection.shutdown(socket.SHUT_WR)
-        assert re.match(rb"HTTP/1.0 (400|401|404|501) |$", stream.read())
 
 
 # Faults

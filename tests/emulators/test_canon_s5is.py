@@ -3,7 +3,6 @@
 import contextlib
 import socket
 import struct
-import sys
 import threading
 import time
 
@@ -14,13 +13,11 @@ from cotarget.emulators import canon_s5is, ptpip
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isCamera, S5isServer, Shutter, Viewfinder
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed
-from cotarget.errors import DeviceError
 from tests.support.plants import DEADLINE_S, LensModel, decoded, plain, publish, wait_for
 
 OK, BUSY = 0x2001, 0x2019
 ZOOM, EVENT_MODE = 0xD02A, 0xD045
 REPLY_S = 2.5  # that libgphoto2 waits for an answer
-DELAYED_ACK_S = 0.04  # by which Linux acknowledges late
 GREY = 2.0  # grey levels by which JPEG may change an even picture
 SIZE = (64, 48)  # of the pictures of the viewfinder's feed
 
@@ -205,19 +202,6 @@ def test_events_are_sent_or_fetched_by_mode(mode, interrupts, checked):
         assert bench.events() == [(0xC00C, ())] * checked
 
 
-def test_the_viewfinder_averages_areas():
-    with Bench() as bench:
-        bench.ask(0x900B)
-        chequered = plain(SIZE, 0)
-        chequered[::2, ::2] = chequered[1::2, 1::2] = 200
-        publish(bench.preview, 0, chequered)
-        found = bench.answer(0x901D)
-        assert found.parameters == (len(found.data),)
-        image = decoded(found.data)
-        assert image.shape == (24, 32, 3)
-        np.testing.assert_allclose(image, 100, atol=GREY)
-
-
 def test_the_viewfinder_gives_each_picture_once(monkeypatch):
     monkeypatch.setattr(canon_s5is, "PICTURE_WAIT_S", 0.05)
     with Bench() as bench:
@@ -256,110 +240,6 @@ def test_a_still():
         bench.ask(0x901A)
         (_, (later,)), _ = bench.events_when(2)
         assert [bench.code(0x1009, each) for each in (handle, later)] == [0x2009, OK]  # it takes the first one's place
-
-
-def test_the_camera_and_its_viewfinder_are_busy_during_a_still():
-    go = threading.Event()
-
-    def still():
-        assert go.wait(DEADLINE_S)
-        return plain(SIZE, 50)
-
-    with Bench(still=still) as bench:
-        bench.ask(0x900B)
-        bench.ask(0x901A)
-        show(bench.preview, 70, 0)
-        assert bench.code(0x901D) == bench.code(0x901A) == bench.code(0x900B) == bench.set(ZOOM, 5) == BUSY
-        assert bench.events() == []
-        assert bench.get(ZOOM) == 0  # queries work
-        go.set()
-        bench.events_when(2)
-        show(bench.preview, 90, 1)
-        np.testing.assert_allclose(decoded(bench.ask(0x901D)), 90, atol=GREY)
-
-
-def test_a_still_that_cannot_be_taken():
-    def still():
-        raise DeviceError("no renderer")
-
-    with Bench(still=still) as bench:
-        bench.ask(0x901A)
-        assert bench.events_when(1) == [(0x400D, ())]
-        assert bench.set(ZOOM, 5) == OK
-
-
-class Stills:
-    """Takes each still when it is let."""
-
-    def __init__(self, count):
-        self.let = [threading.Event() for _ in range(count)]
-        self.begun = [threading.Event() for _ in range(count)]
-        self._calls = iter(range(count))
-
-    def __call__(self):
-        call = next(self._calls)
-        self.begun[call].set()
-        assert self.let[call].wait(DEADLINE_S)
-        return plain(SIZE, 50)
-
-
-def test_a_still_is_lost_at_power_off():
-    stills = Stills(2)
-    with Bench(still=stills) as bench:
-        bench.set(ZOOM, 99)
-        before = set(threading.enumerate())
-        bench.ask(0x901A)
-        (first,) = set(threading.enumerate()) - before
-        assert stills.begun[0].wait(DEADLINE_S)
-        bench.camera.switch_off()
-        assert bench.code(0x1015, ZOOM) == 0x2003
-        bench.ask(0x1002, 1)
-        assert bench.code(0x1015, ZOOM) == 0x200A
-        bench.ask(0x9008)
-        assert bench.get(ZOOM) == bench.lens.position() == 0
-        assert bench.events() == [(0xC00C, ())]
-        bench.ask(0x901A)
-        assert stills.begun[1].wait(DEADLINE_S)
-        stills.let[0].set()
-        first.join(DEADLINE_S)
-        assert bench.events() == []
-        assert bench.set(ZOOM, 5) == BUSY  # the second is still under way
-        stills.let[1].set()
-        assert [code for code, _ in bench.events_when(2)] == [0xC009, 0x400D]
-
-
-def test_a_new_session_has_no_old_events_and_no_viewfinder(monkeypatch):
-    monkeypatch.setattr(canon_s5is, "PICTURE_WAIT_S", 0.05)
-    stills = Stills(1)
-    with Bench(still=stills) as bench:
-        bench.ask(0x900B)
-        bench.ask(0x9009)
-        bench.ask(0x9008)
-        bench.ask(0x900B)
-        bench.camera.disconnected()
-        bench.ask(0x1002, 1)
-        assert bench.events() == []  # those were of the session before
-        show(bench.preview, 40, 0)
-        assert bench.code(0x901D) == BUSY  # the viewfinder is off
-        bench.ask(0x900B)
-        bench.ask(0x901A)
-        bench.camera.disconnected()  # in the middle of a still
-        stills.let[0].set()
-        bench.shutter.close()
-        bench.ask(0x1002, 1)
-        show(bench.preview, 40, 1)
-        assert bench.code(0x901D) == BUSY
-
-
-def test_a_busy_camera_refuses_commands_and_answers_queries():
-    with Bench() as bench:
-        bench.faults.set("busy")
-        for code in (0x1016, 0x9008, 0x9009, 0x900B, 0x900C, 0x901A, 0x901D):
-            assert bench.code(code, ZOOM, data=b"\x05\0") == BUSY
-        assert bench.get(ZOOM) == 0
-        assert bench.lens.commands == []
-        bench.faults.set("busy", False)
-        assert bench.set(ZOOM, 5) == OK
 
 
 # On the wire: what libgphoto2 does not show in the tests of its driver
@@ -471,29 +351,6 @@ def test_a_still_interrupts_on_the_event_connection(server):
 
 
 @pytest.mark.wire
-def test_one_initiator_at_a_time(server, monkeypatch):
-    with Initiator(server.port):
-        monkeypatch.setattr(ptpip, "HANDOVER_S", 0.05)
-        with Line(server.port, INIT_COMMAND) as second:
-            assert second.packet() == (5, struct.pack("<I", 2))
-            assert second.ends()
-    monkeypatch.undo()
-    for _ in range(5):  # a client may reconnect at once
-        with Initiator(server.port) as camera:
-            camera.shoot()
-
-
-@pytest.mark.wire
-@pytest.mark.parametrize("noise", [b"GET / HTTP/1.0\r\n\r\n", bytes(8), bytes.fromhex("08000000 0d000000")])
-def test_noise_ends_its_own_connection_only(server, noise):
-    with Initiator(server.port) as camera, Line(server.port, noise) as stranger:
-        assert stranger.ends()
-        assert camera.ask(0x1001)[0] == OK
-        camera.socket.sendall(bytes(8))
-        assert camera.ends()
-
-
-@pytest.mark.wire
 def test_faults_of_the_line(server):
     with Initiator(server.port) as camera:
         camera.shoot()
@@ -540,33 +397,3 @@ def test_an_absent_camera_comes_back_in_play_mode(server, fault, zoom):
         assert camera.ask(0x1015, ZOOM)[0] == 0x200A
         camera.shoot()
         assert camera.ask(0x1015, ZOOM) == (OK, struct.pack("<H", zoom))
-
-
-@pytest.mark.wire
-def test_closing_waits_for_a_still_and_not_for_a_slow_answer():
-    stills, before = Stills(1), set(threading.enumerate())
-    with S5isServer(Feed(), stills, LensModel(), shutter_s=0.0) as server, Initiator(server.port) as camera:
-        camera.shoot()
-        assert camera.ask(0x901A)[0] == OK
-        assert stills.begun[0].wait(DEADLINE_S)
-        server.faults.set("slow")
-        camera.request(0x1001)
-        letting = threading.Timer(0.1, stills.let[0].set)
-        letting.start()
-        server.close()
-        assert camera.ends()
-        assert set(threading.enumerate()) - before <= {letting}
-        letting.join(DEADLINE_S)
-
-
-@pytest.mark.wire
-@pytest.mark.skipif(sys.platform != "linux", reason="acknowledging at once is an option of Linux")
-def test_requests_and_their_data_are_not_held_up(server):
-    with Initiator(server.port) as camera:  # which sends them apart and without TCP_NODELAY, as libgphoto2 does
-        camera.shoot()
-        took = []
-        for position in range(30):
-            began = time.monotonic()
-            assert camera.zoom(position) == OK
-            took.append(time.monotonic() - began)
-        assert min(took[10:]) < DELAYED_ACK_S / 2

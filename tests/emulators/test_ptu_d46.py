@@ -5,23 +5,19 @@ Most of it runs in simulated time; expectations are the sentences of the manuals
 
 import math
 import socket
-import threading
 import time
 from dataclasses import replace
 
 import pytest
 import serial
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cotarget.emulators.faults import Faults
-from cotarget.emulators.ptu_d46.firmware import COMMANDS, D46, D46_FAULTS
+from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import D46_PAPER, D46_STOCK, E_SERIES, UnitProfile
 from cotarget.emulators.serve import Wire
-from cotarget.errors import ConfigError, DeviceError
+from cotarget.errors import ConfigError
 from tests.support.plants import DEADLINE_S, AxisModel, LiveUnit, wait_for
 
-PROPERTY = settings(derandomize=True, database=None, deadline=None, max_examples=100)
 STEP_S = 1e-3  # of simulated time
 LONG_S = 60.0  # of simulated time: more than a reset of the D46 takes
 SOON_S = 0.02  # of simulated time: by how much moves may be off what was worked by hand
@@ -363,29 +359,6 @@ def test_the_line_can_be_set(bench):
     assert (bench.unit.baud, bench.unit.byte_delay_s) == (600, 0.0)
 
 
-NAMES = sorted({command.name.replace("x", axis) for command in COMMANDS for axis in "PT"})
-TEXTS = st.tuples(
-    st.sampled_from(NAMES),
-    st.sampled_from(["", "0", "-100", "3000", "-99999999", "E", "D", "V", "U", "P"]) | st.text(max_size=1),
-    st.sampled_from(" \r\n"),
-).map("".join)
-
-
-@PROPERTY
-@given(
-    unit=st.sampled_from([D46_STOCK, D46_PAPER, E_SERIES]),
-    turns=st.lists(st.tuples(TEXTS, st.floats(0.0, 1.0)), min_size=20, max_size=60),
-)
-def test_no_command_raises_or_leaves_the_stops(unit, turns):
-    bench = Bench(unit)
-    for text, pause in turns:
-        bench.unit.receive(text.encode("latin-1", "replace"))
-        bench.t += pause
-        bench.unit.output()
-        for plant, (lowest, highest) in ((bench.pan, unit.pan), (bench.tilt, unit.tilt)):
-            assert lowest - unit.stop_margin <= plant.position() <= highest + unit.stop_margin
-
-
 def test_a_profile_from_degrees():
     unit = UnitProfile.from_degrees((-180, 180), (-80, 30), 0.0514286, 100, 200)
     # 180 / 0.0514286 = 3499.998, 80 / 0.0514286 = 1555.555, 30 / 0.0514286 = 583.33
@@ -438,25 +411,6 @@ def test_faults(bench, fault):
     bench.talk(*after)
 
 
-def test_garbage_has_the_length_of_the_reply(bench):
-    bench.faults.set("garbage")
-    said = bench("PP ")
-    assert len(said) == len("* 0\r\n")
-    assert said != "* 0\r\n"
-
-
-def test_a_unit_that_lost_power_stands_until_its_reset(bench):
-    bench("PP1000 ")
-    bench.run(0.3)
-    bench.faults.set("power-cycle")
-    bench.run(D46_STOCK.boot_s + 0.1)
-    assert bench.pan.position() == pytest.approx(300, abs=1)
-    bench("ED FT ")
-    assert bench.wait("R ", "*\r\n")[0] == "!T!T!P!P*\r\n"
-    bench.talk(("PP PX ", "* 0|* 3090|"))
-    assert bench.pan.position() == 0
-
-
 def test_an_uncalibrated_e_series():
     bench = Bench(E_SERIES)
     bench.faults.set("power-cycle")
@@ -476,19 +430,6 @@ class TestWire:
             heard += [(bench.t, byte) for byte in wire.step(bench.t)]
         assert bytes(byte for _, byte in heard) == b"* 0\r\n"
         assert [t for t, _ in heard] == pytest.approx([n / 960 for n in range(4, 9)])
-
-    def test_a_late_thread_does_not_slow_the_line(self, bench):
-        wire = Wire(bench.unit)
-        wire.feed(b"PP ", bench.t)
-        bench.t = 1.0
-        assert wire.step(bench.t) == b"* 0\r\n"
-
-    def test_echo_overlaps_what_is_still_sent(self):
-        bench = Bench(terse=False)
-        wire = Wire(bench.unit)
-        wire.feed(b"PP ", bench.t)
-        bench.t = 2.5 / 960
-        assert wire.step(bench.t) == b"P"
 
     def test_a_new_baud_holds_after_the_reply(self, bench):
         wire = Wire(bench.unit)
@@ -537,12 +478,6 @@ def answers(live, tcp):
 @pytest.mark.wire
 @pytest.mark.parametrize("tcp", [False, True])
 class TestPorts:
-    def test_moves_and_reads_back(self, tcp):
-        with LiveUnit(serial=not tcp, tcp=0 if tcp else None) as live, live.open(tcp) as port:
-            replies = [ask(port, text) for text in (b"ED ", b"FT ", b"PP50 ", b"A ", b"PP ")]
-            assert replies == [b"ED *\r\n", b"*\r\n", b"*\r\n", b"*\r\n", b"* 50\r\n"]
-            assert live.pan.position() == 50
-
     def test_unplugged_and_replugged(self, tcp):
         with LiveUnit(tcp=0) as live:
             with live.open(tcp) as port:
@@ -594,24 +529,3 @@ def test_a_second_client_replaces_the_first():
             assert ask(second, TILT_QUERY) == TILT_REPLY
             with pytest.raises(serial.SerialException):
                 first.read()
-
-
-@pytest.mark.wire
-def test_the_pseudo_terminal_is_not_served_while_a_client_is_on_tcp():
-    with LiveUnit(tcp=0) as live:
-        with live.open() as other, live.open(tcp=True) as first:
-            assert ask(first, TILT_QUERY) == TILT_REPLY
-            other.write(b"TP100 ")
-            assert ask(first, b"TO ").startswith(b"TO * Current Tilt position is 0")
-        wait_for(lambda: answers(live, tcp=False))
-
-
-@pytest.mark.wire
-def test_a_taken_port_is_refused_and_no_thread_is_left():
-    before = threading.active_count()
-    with LiveUnit(tcp=0) as live:
-        port = int(live.ports.url.rpartition(":")[2])
-        with pytest.raises(DeviceError, match=f"127.0.0.1:{port}"):
-            LiveUnit(tcp=port)
-        assert threading.active_count() == before + 1
-    assert threading.active_count() == before

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from cotarget.config import RigConfig, SimConfig, parse_config
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.serve import JsonLines
 from cotarget.emulators.world import (
     FIXED_HZ,
@@ -119,11 +118,6 @@ def test_a_lens_moves_within_its_range(clock):
     assert (plant.position(), plant.moving()) == (0, False)
 
 
-def test_an_unknown_fault_is_refused():
-    with pytest.raises(ConfigError, match=r"'rust'.*: cut, stall"):
-        Faults(["stall", "cut"]).set("rust")
-
-
 def test_real_time_has_lower_rates_and_fewer_effects():
     config = RigConfig()
     sim = paced(config).sim
@@ -228,17 +222,6 @@ def has_failed(world):
     except DeviceError:
         return True
     return False
-
-
-@pytest.mark.wire
-def test_a_failure_at_the_first_image_is_raised_at_once(fake):
-    fake.act = no_memory
-    threads = threading.active_count()
-    begun = time.monotonic()
-    with pytest.raises(DeviceError, match=r"the simulated world failed: MemoryError\('no more'\)"):
-        LiveWorld(RigConfig())
-    assert time.monotonic() - begun < DEADLINE_S
-    assert threading.active_count() == threads
 
 
 @pytest.mark.wire
