@@ -1,7 +1,7 @@
 """The fixed camera on an Axis video server, read over HTTP.
 
 `AxisCamera` drains the MJPEG stream on its own thread into a `FrameBuffer`. `VideoServer` speaks the server's HTTP
-interface, `WebDevice` any device's HTTP with basic or digest authentication.
+interface, with basic or digest authentication.
 
 Sources: Axis' VAPIX HTTP API, versions 2 and 3, and the manual of the 241Q.
 """
@@ -19,10 +19,10 @@ from urllib.parse import unquote, urlsplit
 
 from annotated_types import Gt, Interval
 
-from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, FrameCounts, StreamRefusedError
+from cotarget.drivers.frame_buffer import BufferedCamera, BusyError, FrameBuffer, StreamRefusedError
 from cotarget.drivers.mjpeg import MultipartReader, boundary_of, import_simplejpeg
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError
-from cotarget.rig import CameraSpec, Clock, Frame
+from cotarget.rig import CameraSpec, Clock
 from cotarget.schema import Check, Needed, NotNegative, Positive, Size, model
 
 if TYPE_CHECKING:
@@ -35,6 +35,12 @@ PARAMETER_PATHS = ("/axis-cgi/param.cgi", "/axis-cgi/view/param.cgi")
 STATUS_PATH = "/axis-cgi/videostatus.cgi"
 STREAM_PATH = "/axis-cgi/mjpg/video.cgi"
 AXIS = "AXIS"  # the brand that an Axis reports
+# On a local network a running device accepts a connection within milliseconds [s].
+CONNECT_S = 2.0
+# Limits of a text answer [bytes], [pieces]: a device may send a text without end, byte by byte.
+LONGEST_TEXT, MOST_PIECES = 65536, 64
+# Longest quotation of a device's text in a message [characters].
+LONGEST_QUOTE = 60
 # A stream has stalled after this time without a byte [s], or after this many frame periods where that is longer.
 SILENCE_S, SILENCE_PICTURES = 2.0, 3.0
 
@@ -95,17 +101,13 @@ class Stream:
 
 
 class VideoServer:
-    """An Axis video server; a network camera counts as one with a single input.
+    """An Axis video server; a network camera counts as one with a single input. Close it after use.
 
-    Every request raises DeviceError where the server cannot be reached.
+    Every request has its own connection, and raises DeviceError where the server cannot be reached, does not speak
+    HTTP, breaks off or stops sending.
 
     Args:
         config: address, input and image settings of the fixed camera.
-
-    Attributes:
-        name: the server's name in messages.
-        web: its HTTP interface, to be closed.
-        silence_s: a stream has stalled after this time without a byte [s].
 
     Raises:
         ConfigError: the address is invalid.
@@ -116,9 +118,28 @@ class VideoServer:
         self._config, parts = config, urlsplit(config.url)
         self._user = config.user or unquote(parts.username or "")
         self._password = config.password or unquote(parts.password or "") or os.environ.get(PASSWORD_VARIABLE, "")
+        # Address without user and password, which is the server's name in messages.
         self.name = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}".rstrip("/")
         self.silence_s = max(SILENCE_S, SILENCE_PICTURES / config.rate_hz)
-        self.web = WebDevice(self.name, self._user, self._password, self.silence_s)
+        self._socket: socket.socket | None = None  # of the response that is being read
+        self._ended = False
+        self._lock = threading.Lock()
+        self._httpx = _import_httpx()
+        try:
+            self._client: httpx.Client = self._httpx.Client(
+                base_url=self.name,
+                auth=_authentication(self._user, self._password) if self._user else None,
+                timeout=self._httpx.Timeout(self.silence_s, connect=CONNECT_S),
+                # Loading the machine's certificates takes longer than a connection; http needs none.
+                verify=self.name.startswith("https:"),
+                # Proxies and logins of the environment do not apply to a local device.
+                trust_env=False,
+                # A kept connection may be dead by the next request; a new one costs a millisecond.
+                limits=self._httpx.Limits(max_keepalive_connections=0),
+                headers={"Connection": "close", "Accept-Encoding": "identity", "User-Agent": "cotarget"},
+            )
+        except (self._httpx.InvalidURL, ValueError):
+            raise ConfigError(f"hardware.fixed.url: '{self.name}' is not like http://192.168.0.90") from None
 
     def identify(self) -> dict[str, str]:
         """List the parameters of brand, properties and inputs; {} where the server lists none, or not for this user."""
@@ -135,7 +156,7 @@ class VideoServer:
     def has_video(self) -> bool | None:
         """Ask whether a camera is connected to the input; None where the server does not say."""
         camera = self._config.camera
-        text = self.web.text(STATUS_PATH, {"status": str(camera)}) or ""
+        text = self.text(STATUS_PATH, {"status": str(camera)}) or ""
         match = re.search(rf"^\s*Video\s+{camera}\s*=\s*(no\s+)?video\b", text, re.IGNORECASE | re.MULTILINE)
         return None if match is None else match[1] is None
 
@@ -194,21 +215,19 @@ class VideoServer:
             query["resolution"] = config.resolution
         if api.startswith("2"):
             query["des_fps"] = rate  # the name of fps in version 2
-        with self.web.ask(STREAM_PATH, query) as response:
+        with self.ask(STREAM_PATH, query) as response:
             kind = response.headers.get("content-type", "")
             if response.status_code != 200 or not kind.lower().strip().startswith("multipart/"):
                 raise self._refusal(response)
-            yield Stream(boundary_of(kind), self.web.pieces(response))
+            yield Stream(boundary_of(kind), self.pieces(response))
 
     def _parameters(self, path: str, group: str) -> dict[str, str] | None:
         """List a group of parameters, names without "root."; {} where there are none, None where access is refused."""
-        text = self.web.text(path, {"action": "list", "group": group})
+        text = self.text(path, {"action": "list", "group": group})
         if text is None:
             return None
         lines = (line.strip().removeprefix("root.").partition("=") for line in text.splitlines())
-        return {
-            name: self.web.quote(value) for name, equals, value in lines if equals and re.fullmatch(r"[\w.]+", name)
-        }
+        return {name: self.quote(value) for name, equals, value in lines if equals and re.fullmatch(r"[\w.]+", name)}
 
     def _refusal(self, response: "httpx.Response") -> DeviceError:
         """Make the error for a response that is no stream, with what would be right."""
@@ -225,7 +244,7 @@ class VideoServer:
         if status >= 500:
             return BusyError(f"{name} fails with status {status}: restart it if that lasts")
         if 300 <= status < 400:
-            target = self.web.quote(response.headers.get("location", "another address"))
+            target = self.quote(response.headers.get("location", "another address"))
             return StreamRefusedError(
                 f"{name} sends on to {target}: set hardware.fixed.url to where the server really is"
             )
@@ -235,60 +254,14 @@ class VideoServer:
         if status != 200:
             asked = f"camera {config.camera}, resolution '{config.resolution}', compression {config.compression}"
             return StreamRefusedError(f"{name} refuses {asked} ({status}): check them in hardware.fixed")
-        kind = self.web.quote(response.headers.get("content-type", "")) or "something"
-        said = self.web.quote(self.web.read(response)) if kind.lower().startswith("text/plain") else ""
+        kind = self.quote(response.headers.get("content-type", "")) or "something"
+        said = self.quote(self.read(response)) if kind.lower().startswith("text/plain") else ""
         said = f" '{said}'" if said else ""
         return StreamRefusedError(
             f"{name} sends {kind}{said}, no stream of pictures: check hardware.fixed.url and camera"
         )
 
-
-# HTTP access to a device
-
-# On a local network a running device accepts a connection within milliseconds [s].
-CONNECT_S = 2.0
-# Limits of a text answer [bytes], [pieces]: a device may send a text without end, byte by byte.
-LONGEST_TEXT, MOST_PIECES = 65536, 64
-# Longest quotation of a device's text in a message [characters].
-LONGEST_QUOTE = 60
-
-
-class WebDevice:
-    """A device that speaks HTTP; every request has its own connection.
-
-    Args:
-        url: address without user and password; messages use it as the name.
-        user: user name; empty for none.
-        password: never shown in messages.
-        silence_s: a device has stopped sending after this time without a byte [s].
-
-    Raises:
-        ConfigError: the address is invalid.
-        DeviceError: httpx is missing.
-    """
-
-    def __init__(self, url: str, user: str, password: str, silence_s: float) -> None:
-        self.url = url
-        self._password = password
-        self._socket: socket.socket | None = None  # of the response that is being read
-        self._ended = False
-        self._lock = threading.Lock()
-        self._httpx = _import_httpx()
-        try:
-            self._client: httpx.Client = self._httpx.Client(
-                base_url=url,
-                auth=_authentication(user, password) if user else None,
-                timeout=self._httpx.Timeout(silence_s, connect=CONNECT_S),
-                # Loading the machine's certificates takes longer than a connection; http needs none.
-                verify=url.startswith("https:"),
-                # Proxies and logins of the environment do not apply to a local device.
-                trust_env=False,
-                # A kept connection may be dead by the next request; a new one costs a millisecond.
-                limits=self._httpx.Limits(max_keepalive_connections=0),
-                headers={"Connection": "close", "Accept-Encoding": "identity", "User-Agent": "cotarget"},
-            )
-        except (self._httpx.InvalidURL, ValueError):
-            raise ConfigError(f"hardware.fixed.url: '{url}' is not like http://192.168.0.90") from None
+    # HTTP
 
     def end(self) -> None:
         """Break off a request that another thread reads, and refuse further requests."""
@@ -305,22 +278,14 @@ class WebDevice:
 
     @contextlib.contextmanager
     def ask(self, path: str, query: dict[str, str]) -> Iterator["httpx.Response"]:
-        """Send a GET request, with the authentication that the device demands, and hold the response for a with block.
-
-        Raises:
-            DeviceError: the device cannot be reached, or does not speak HTTP.
-        """
+        """Send a GET request, authenticated as the server demands, and hold the response for a with block."""
         with self._one_line_errors():
             response = self._client.send(self._client.build_request("GET", path, params=query), stream=True)
         with contextlib.closing(response), self._registered(response):
             yield response
 
     def text(self, path: str, query: dict[str, str]) -> str | None:
-        """Request a short text; empty where the device has none, None where access is refused.
-
-        Raises:
-            DeviceError: as `ask`.
-        """
+        """Request a short text; empty where the server has none, None where access is refused."""
         with self.ask(path, query) as response:
             if response.status_code in (401, 403):
                 return None
@@ -336,11 +301,7 @@ class WebDevice:
         return text[:LONGEST_TEXT].decode("latin-1")
 
     def pieces(self, response: "httpx.Response") -> Iterator[bytes]:
-        """Yield the bytes of a response as they arrive.
-
-        Raises:
-            DeviceError: the device broke off or stopped sending.
-        """
+        """Yield the bytes of a response as they arrive."""
         with self._one_line_errors():
             yield from response.iter_raw()
 
@@ -356,7 +317,7 @@ class WebDevice:
         """Register a response so that `end` can break it off."""
         with self._lock:
             if self._ended:
-                raise DeviceError(f"{self.url} is closed")
+                raise DeviceError(f"{self.name} is closed")
             self._socket = response.extensions["network_stream"].get_extra_info("socket")
         try:
             yield
@@ -373,7 +334,7 @@ class WebDevice:
         try:
             yield
         except wrong as error:
-            raise DeviceError(f"{self.url} {self._reason(error)}") from None
+            raise DeviceError(f"{self.name} {self._reason(error)}") from None
 
     def _reason(self, error: Exception) -> str:
         httpx = self._httpx
@@ -426,7 +387,7 @@ FROZEN_S = 1.0
 FRUITLESS_SILENCES = 2.0
 
 
-class AxisCamera:
+class AxisCamera(BufferedCamera):
     """The fixed camera on an Axis video server; close it after use.
 
     A frame's time is the arrival of its first byte, less the configured latency.
@@ -451,7 +412,7 @@ class AxisCamera:
             DeviceError: the server cannot be reached, reports nothing, is no Axis, or has no such input or no video.
         """
         server = VideoServer(settings)
-        with contextlib.closing(server.web):
+        with contextlib.closing(server):
             return server.describe()
 
     def __init__(self, config: AxisSettings, clock: Clock) -> None:
@@ -476,26 +437,12 @@ class AxisCamera:
             self.close()
             raise
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) [px]."""
-        return self._config.size
-
-    @property
-    def counts(self) -> FrameCounts:
-        """Frame counts of the stream so far."""
-        return self._frames.counts
-
-    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Wait for a frame, see `FrameBuffer.read`."""
-        return self._frames.read(newer_than, timeout)
-
     def close(self) -> None:
         """End the stream and the thread; may be called again."""
         self._frames.close()
-        self._server.web.end()
+        self._server.end()
         if self._frames.join():
-            self._server.web.close()
+            self._server.close()
 
     def _stream(self) -> None:
         """Open the stream and take its images until it ends."""

@@ -10,13 +10,12 @@ import json
 import re
 import socket
 import sys
-from typing import Annotated, Protocol, TextIO
+from typing import Annotated, TextIO
 
 import numpy as np
 
 from cotarget.errors import DeviceError
 from cotarget.geometry import RigidTransform, pose_dict
-from cotarget.rig import Board
 from cotarget.schema import Check, model
 
 PERSONS_PATIENCE = 60.0  # time to walk there, turn the board and hold it still [s]
@@ -51,14 +50,7 @@ class BoardSettings:
     presenter: Annotated[str, Check(_presenter)] = "person"
 
 
-class ClosingBoard(Board, Protocol):
-    """A board whose holder has a connection to close."""
-
-    def close(self) -> None:
-        """Close the connection; may be called again."""
-
-
-def make_board(config: BoardSettings) -> ClosingBoard:
+def make_board(config: BoardSettings) -> "PersonBoard | SocketBoard":
     """Open the configured holder of the board: a person, or a program at a socket.
 
     Raises:

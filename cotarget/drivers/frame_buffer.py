@@ -41,21 +41,13 @@ class StreamRefusedError(DeviceError):
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """Frame counts of a camera.
+    """Frame counts of a camera."""
 
-    Attributes:
-        frames: new frames.
-        skipped: new frames that were not read before the next one came.
-        repeated: frames equal to the one before.
-        refused: frames that were damaged, cut short or late; damage inside of a JPEG is only seen when it is read.
-        reconnects: number of times that the stream was opened again.
-    """
-
-    frames: int = 0
-    skipped: int = 0
-    repeated: int = 0
-    refused: int = 0
-    reconnects: int = 0
+    frames: int = 0  # new frames
+    skipped: int = 0  # new frames that were not read before the next one came
+    repeated: int = 0  # frames equal to the one before
+    refused: int = 0  # damaged, cut short or late frames; damage inside of a JPEG is only seen when it is read
+    reconnects: int = 0  # number of times that the stream was opened again
 
 
 @dataclass(eq=False)
@@ -85,15 +77,8 @@ class FrameBuffer:
         decode: decoder of the camera's JPEGs; raises DamagedError.
     """
 
-    def __init__(
-        self,
-        name: str,
-        clock: Clock,
-        size: tuple[int, int],
-        latency_s: float,
-        fresh_s: float,
-    ) -> None:
-        self.name, self._clock, self._size = name, clock, size
+    def __init__(self, name: str, clock: Clock, size: tuple[int, int], latency_s: float, fresh_s: float) -> None:
+        self.name, self._clock, self.size = name, clock, size
         self._latency_s, self._fresh_s, self.decode = latency_s, fresh_s, StreamDecoder().decode
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -298,8 +283,8 @@ class FrameBuffer:
             image = self._decode(newest)
             if image is None:
                 continue
-            if (size := (image.shape[1], image.shape[0])) != self._size:
-                now, was = (f"{width}x{height}" for width, height in (size, self._size))
+            if (size := (image.shape[1], image.shape[0])) != self.size:
+                now, was = (f"{width}x{height}" for width, height in (size, self.size))
                 raise DeviceError(
                     f"{self.name} now sends {now} where it sent {was}: set its resolution back, or open it again"
                 )
@@ -365,6 +350,26 @@ class FrameBuffer:
             return f"{self.name} sent no newer picture within {timeout:g} s"
         remark = f"; {self._remark}" if self._remark else ""
         return f"no new picture for {now - self._new_at:.1f} s: {reason}{remark}"
+
+
+class BufferedCamera:
+    """The calls of a camera that its `FrameBuffer` answers."""
+
+    _frames: FrameBuffer
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the frames [px]."""
+        return self._frames.size
+
+    @property
+    def counts(self) -> FrameCounts:
+        """Frame counts so far."""
+        return self._frames.counts
+
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        """Wait for a frame, see `FrameBuffer.read`."""
+        return self._frames.read(newer_than, timeout)
 
 
 def _equal(data: bytes | Image, other: bytes | Image) -> bool:

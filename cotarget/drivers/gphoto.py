@@ -1,4 +1,4 @@
-"""Calls of python-gphoto2 behind a Protocol, so that tests can replace the camera.
+"""The camera calls of python-gphoto2 that the driver uses.
 
 Some calls of python-gphoto2 hold Python's interpreter lock while they wait for the camera; a hung camera would then
 stop every thread, the head's included. Opening, settings, previews and stills release the lock. Disconnecting does not,
@@ -21,7 +21,7 @@ import socket
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError
 
@@ -194,63 +194,19 @@ class LinkError(Exception):
 
 @dataclass(frozen=True)
 class Setting:
-    """A setting of a camera.
+    """A setting of a camera."""
 
-    Attributes:
-        kind: type of the value: "range" a number, "switch" 0 or 1, "choice" one of ``choices``, "date" seconds since
-            1970, "text" any text.
-        value: present value.
-        low: least value of a range.
-        high: greatest value of a range.
-        step: step between values of a range.
-        choices: valid values of a choice or switch.
-        readonly: whether the setting can only be read.
-    """
-
-    kind: Literal["range", "switch", "choice", "date", "text"]
-    value: str | float
-    low: float = 0.0
+    kind: Literal["range", "switch", "choice", "date", "text"]  # a switch is 0 or 1, a date in seconds since 1970
+    value: str | float  # the present one
+    low: float = 0.0  # of a range
     high: float = 0.0
     step: float = 1.0
-    choices: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()  # valid values of a choice or switch
     readonly: bool = False
 
 
-class CameraLink(Protocol):
-    """The camera calls that the driver uses, all from one thread. Each raises LinkError where libgphoto2 fails."""
-
-    def open(self) -> str:
-        """Connect, possibly again after `close`; return the camera's name.
-
-        Raises:
-            ConfigError: the port or model is invalid.
-            DeviceError: the camera is not there, or may not be used.
-        """
-
-    def close(self) -> None:
-        """Disconnect; does nothing without a connection."""
-
-    def names(self) -> list[str]:
-        """List the names of the camera's settings."""
-
-    def get(self, name: str) -> Setting:
-        """Read a setting."""
-
-    def put(self, name: str, value: str | float) -> None:
-        """Write a setting."""
-
-    def preview(self) -> bytes:
-        """Fetch a viewfinder frame, as the camera encodes it."""
-
-    def shoot(self) -> tuple[str, str]:
-        """Take a still; return its folder and name on the camera."""
-
-    def fetch(self, still: tuple[str, str]) -> bytes:
-        """Fetch the contents of a still."""
-
-
 class GphotoLink:
-    """A camera through python-gphoto2.
+    """A camera through python-gphoto2, used by one thread; each call raises LinkError where libgphoto2 fails.
 
     Args:
         port: in gphoto2's notation.
@@ -266,7 +222,12 @@ class GphotoLink:
         self._camera: Any = None
 
     def open(self) -> str:
-        """Connect; return the camera's name."""
+        """Connect, possibly again after `close`; return the camera's name.
+
+        Raises:
+            ConfigError: the model is unknown, or gphoto2 is not installed.
+            DeviceError: the camera is not there, or may not be used.
+        """
         self._gp = gp = _gphoto2()
         ports, abilities = gp.PortInfoList(), gp.CameraAbilitiesList()
         camera: Any = None
@@ -321,7 +282,7 @@ class GphotoLink:
         return here[0]
 
     def close(self) -> None:
-        """Disconnect without blocking other threads while the camera does not answer."""
+        """Disconnect, if connected, without blocking other threads while the camera does not answer."""
         camera, self._camera = self._camera, None
         if camera is not None:
             with standard_input_kept():
@@ -361,7 +322,7 @@ class GphotoLink:
         self._call("set_single_config", name, widget)
 
     def preview(self) -> bytes:
-        """Fetch a viewfinder frame."""
+        """Fetch a viewfinder frame, as the camera encodes it."""
         file = self._call("capture_preview")  # owns the data until bytes() has copied them
         return bytes(file.get_data_and_size())
 

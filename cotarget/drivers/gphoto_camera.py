@@ -18,12 +18,11 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Annotated, TypeVar
 
-from cotarget.drivers.frame_buffer import FrameBuffer, FrameCounts
+from cotarget.drivers.frame_buffer import BufferedCamera, FrameBuffer
 from cotarget.drivers.gphoto import (
     BAD_PARAMETERS,
     CAMERA_BUSY,
     LOST,
-    CameraLink,
     GphotoLink,
     LinkError,
     Setting,
@@ -97,29 +96,17 @@ class GphotoSettings:
 
 @dataclass
 class SharedState:
-    """Commands to the camera's thread and its results; hold ``changed`` to read or write them.
+    """Commands to the camera's thread and its results; hold ``changed``, notified at every change, to use them."""
 
-    Attributes:
-        changed: notified at every change.
-        frames: viewfinder frames; its lock is apart from ``changed``.
-        wanted: commanded lens position.
-        order: sequence number of the lens command.
-        standing: whether the lens has reached the last command.
-        motion: estimated motion of the lens; None before the camera is open.
-        lens_trouble: why the lens does not follow its command; empty if it does.
-        called: whether the camera's thread has a new command.
-        still: future of the still that a caller waits for.
-    """
-
-    frames: FrameBuffer
+    frames: FrameBuffer  # of the viewfinder; its lock is apart from ``changed``
     changed: threading.Condition = field(default_factory=threading.Condition)
-    wanted: int = 0
-    order: int = 0
-    standing: bool = True
-    motion: LensMotion | None = None
-    lens_trouble: str = ""
-    called: bool = False
-    still: "Future[Frame] | None" = None
+    wanted: int = 0  # commanded lens position
+    order: int = 0  # sequence number of the lens command
+    standing: bool = True  # whether the lens has reached the last command
+    motion: LensMotion | None = None  # estimated; None before the camera is open
+    lens_trouble: str = ""  # why the lens does not follow its command; empty if it does
+    called: bool = False  # whether the camera's thread has a new command
+    still: "Future[Frame] | None" = None  # that a caller waits for
 
     @property
     def gone(self) -> str:
@@ -170,7 +157,7 @@ def patiently(clock: Clock, call: Callable[[], T]) -> T:
         clock.sleep_until(clock.now() + BUSY_PAUSE_S)
 
 
-def set_up(link: CameraLink, config: GphotoSettings, clock: Clock, camera: str) -> ZoomSetting:
+def set_up(link: GphotoLink, config: GphotoSettings, clock: Clock, camera: str) -> ZoomSetting:
     """Switch an opened camera to shooting mode and apply the configured settings; ``camera`` names it in messages.
 
     Raises:
@@ -189,7 +176,7 @@ def set_up(link: CameraLink, config: GphotoSettings, clock: Clock, camera: str) 
     return _zoom_setting(link, config, clock, camera, names)
 
 
-def _apply(link: CameraLink, clock: Clock, camera: str, names: Collection[str], name: str, value: str) -> None:
+def _apply(link: GphotoLink, clock: Clock, camera: str, names: Collection[str], name: str, value: str) -> None:
     if name not in names:
         known = closest(names, name)
         raise ConfigError(f"hardware.zoom.settings: the {camera} has no setting '{name}'; valid here: {known}")
@@ -218,7 +205,7 @@ def _check(setting: Setting, where: str, value: str) -> None:
 
 
 def _zoom_setting(
-    link: CameraLink, config: GphotoSettings, clock: Clock, camera: str, names: Collection[str]
+    link: GphotoLink, config: GphotoSettings, clock: Clock, camera: str, names: Collection[str]
 ) -> ZoomSetting:
     """Find the setting that moves the lens, and check it against the configured lens table."""
     name, (first, last) = config.zoom_key, (config.lens[0][0], config.lens[-1][0])
@@ -303,7 +290,7 @@ class Patience:
 class LensJob:
     """Send the lens to the latest command, and verify that it went there."""
 
-    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+    def __init__(self, config: GphotoSettings, clock: Clock, link: GphotoLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._zoom: ZoomSetting | None = None
         self._order = -1  # the command being carried out
@@ -381,7 +368,7 @@ class LensJob:
 class StillJob:
     """Take a still for the caller that waits for one."""
 
-    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+    def __init__(self, config: GphotoSettings, clock: Clock, link: GphotoLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._future: Future[Frame] | None = None
         self._due = -math.inf
@@ -445,7 +432,7 @@ class StillJob:
 class ViewJob:
     """Fetch viewfinder frames and publish the newest."""
 
-    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink, frames: FrameBuffer) -> None:
+    def __init__(self, config: GphotoSettings, clock: Clock, link: GphotoLink, frames: FrameBuffer) -> None:
         self._config, self._clock, self._link, self._frames = config, clock, link, frames
         self._due = -math.inf
         self._patience = Patience(clock)
@@ -514,7 +501,7 @@ FIRST_PAUSE_S, RECONNECT_S = 0.1, 5.0
 class Shooting:
     """Open the camera and run its jobs; all methods are called from one thread."""
 
-    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+    def __init__(self, config: GphotoSettings, clock: Clock, link: GphotoLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._lens = LensJob(config, clock, link, shared)
         self._still = StillJob(config, clock, link, shared)
@@ -627,7 +614,7 @@ STILL_LIMIT_S = 30.0
 CLOSE_LIMIT_S = 3.0
 
 
-class GphotoCamera:
+class GphotoCamera(BufferedCamera):
     """The zoom camera: lens, viewfinder and stills through libgphoto2, on a thread of its own.
 
     A frame's time is the arrival of its last byte, less ``latency_s``, which is measured in the same way at bring-up. A
@@ -655,7 +642,7 @@ class GphotoCamera:
         """Detect the camera without opening it; describe it in one line. See `GphotoLink.look`."""
         return GphotoLink(settings.port, settings.model).look()
 
-    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink | None = None) -> None:
+    def __init__(self, config: GphotoSettings, clock: Clock, link: GphotoLink | None = None) -> None:
         self._config, self._clock = config, clock
         self._name = f"the zoom camera at '{config.port}'"
         self._frames = FrameBuffer(self._name, clock, config.size, config.latency_s, freshness(config))
@@ -676,11 +663,6 @@ class GphotoCamera:
             raise
 
     @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of viewfinder frames [px]."""
-        return self._config.size
-
-    @property
     def still_size(self) -> tuple[int, int]:
         """(width, height) of full stills [px]."""
         return self._config.still_size
@@ -689,15 +671,6 @@ class GphotoCamera:
     def focal_range(self) -> tuple[float, float]:
         """Shortest and longest nominal focal length [px] of viewfinder frames."""
         return self._lens.focal_range
-
-    @property
-    def counts(self) -> FrameCounts:
-        """Frame counts of the viewfinder so far."""
-        return self._frames.counts
-
-    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Wait for a frame, see `FrameBuffer.read`."""
-        return self._frames.read(newer_than, timeout)
 
     def zoom(self, focal_px: float) -> float:
         """Start the lens moving; return at once the nominal focal length [px] of the position that it will reach.

@@ -29,20 +29,13 @@ SIZED_LENGTH = 5
 
 
 class Walk:
-    """Parser of one JPEG's markers, as its bytes arrive.
-
-    Attributes:
-        position: index of the next byte to parse.
-        end: index after the last byte, once that has arrived.
-        broken: whether the data are no JPEG.
-        size: (width, height) [px].
-    """
+    """Parser of one JPEG's markers, as its bytes arrive."""
 
     def __init__(self) -> None:
-        self.position = 2  # behind the first marker
-        self.end: int | None = None
-        self.broken = False
-        self.size = (0, 0)
+        self.position = 2  # index of the next byte to parse: behind the first marker
+        self.end: int | None = None  # index after the last byte, once that has arrived
+        self.broken = False  # whether the data are no JPEG
+        self.size = (0, 0)  # (width, height) [px]
         self._in_scan = False
 
     def advance(self, data: bytes | bytearray) -> None:
@@ -200,8 +193,6 @@ LONGEST_PICTURE = 16_000_000
 LONGEST_SKIP = 1_000_000
 # Start of an image: a marker and the first byte of the next. Nothing else between images contains these bytes.
 START = b"\xff\xd8\xff"
-# Longest list of arrival times; further pieces, which only a hostile server sends, share the last time.
-MOST_ARRIVALS = 10_000
 # Begin of a part's header, for streams whose boundary differs from the announced one.
 HEADERS = (b"\r\nContent-Type:", b"\r\nContent-type:")
 BOUNDARY = re.compile(r"""boundary\s*=\s*(?:"([^"]*)"|([^\s;]+))""", re.IGNORECASE)
@@ -209,17 +200,11 @@ BOUNDARY = re.compile(r"""boundary\s*=\s*(?:"([^"]*)"|([^\s;]+))""", re.IGNORECA
 
 @dataclass(frozen=True)
 class JpegPicture:
-    """A whole JPEG image.
-
-    Attributes:
-        jpeg: its bytes.
-        size: (width, height) in its header [px].
-        t: arrival of its first byte [s].
-    """
+    """A whole JPEG image."""
 
     jpeg: bytes
-    size: tuple[int, int]
-    t: float
+    size: tuple[int, int]  # (width, height) in its header [px]
+    t: float  # arrival of its first byte [s]
 
 
 def boundary_of(content_type: str) -> str | None:
@@ -233,15 +218,12 @@ class MultipartReader:
 
     Args:
         boundary: from `boundary_of`; None where none is announced.
-
-    Attributes:
-        broken: number of images that began and were dropped.
     """
 
     def __init__(self, boundary: str | None = None) -> None:
         own = () if boundary is None else (b"--" + boundary.encode("latin-1", "replace"),)
         self._delimiters = own + HEADERS
-        self.broken = 0
+        self.broken = 0  # number of images that began and were dropped
         self._data = bytearray()
         self._arrivals: deque[tuple[int, float]] = deque()  # (number of bytes, time of arrival) of the data's pieces
         self._picture: Walk | None = None  # of the image at the start of the data
@@ -257,11 +239,7 @@ class MultipartReader:
         """Add bytes that arrived at ``t`` [s]; return the images that they complete."""
         if data:
             self._data += data
-            if len(self._arrivals) < MOST_ARRIVALS:
-                self._arrivals.append((len(data), t))
-            else:
-                count, earlier = self._arrivals.pop()
-                self._arrivals.append((count + len(data), earlier))
+            self._arrivals.append((len(data), t))
         pictures: list[JpegPicture] = []
         while self._skip() and self._begin() and self._continue(pictures):
             pass

@@ -172,19 +172,12 @@ class PolledHeadSettings:
 
 @dataclass(frozen=True)
 class HeadSnapshot:
-    """Positions of both axes at one time, interpolated between polls.
+    """Positions of both axes at one time, interpolated between polls."""
 
-    Attributes:
-        pan: position [steps].
-        tilt: position [steps].
-        moving: whether a move is under way or an axis has not stood for long enough.
-        t: time of the positions [s].
-    """
-
-    pan: float
-    tilt: float
-    moving: bool
-    t: float
+    pan: float  # [steps]
+    tilt: float  # [steps]
+    moving: bool  # whether a move is under way or an axis has not stood for long enough
+    t: float  # time of the positions [s]
 
 
 class AxisTrack:
@@ -235,27 +228,16 @@ class DroppedError(HaltedError):
 
 @dataclass(eq=False)
 class Move:
-    """A request to move both axes.
+    """A request to move both axes."""
 
-    Attributes:
-        number: sequence number of the request; a move numbered before a halt is not sent any more.
-        goals: of pan and tilt [steps].
-        speeds: of pan and tilt [steps/s].
-        wait: whether the caller waits for the end, and so receives the error.
-        deadline: time by which the head should have arrived [s]; None until the move is sent.
-        cuts: how often the move was sent again after the line was silent.
-        error: why the head did not arrive.
-        done: set when the head has arrived, or will not.
-    """
-
-    number: int
-    goals: tuple[int, int]
-    speeds: tuple[int, int]
-    wait: bool = False
-    deadline: float | None = None
-    cuts: int = 0
-    error: DeviceError | None = None
-    done: threading.Event = field(default_factory=threading.Event)
+    number: int  # sequence number of the request; a move numbered before a halt is not sent any more
+    goals: tuple[int, int]  # of pan and tilt [steps]
+    speeds: tuple[int, int]  # of pan and tilt [steps/s]
+    wait: bool = False  # whether the caller waits for the end, and so receives the error
+    deadline: float | None = None  # time by which the head should have arrived [s]; None until the move is sent
+    cuts: int = 0  # how often the move was sent again after the line was silent
+    error: DeviceError | None = None  # why the head did not arrive
+    done: threading.Event = field(default_factory=threading.Event)  # set when the head has arrived, or will not
 
     def finish(self, error: DeviceError | None = None) -> None:
         """End the move and wake the caller that waits."""
@@ -265,17 +247,11 @@ class Move:
 
 @dataclass(eq=False)
 class Halt:
-    """A request to stop both axes.
+    """A request to stop both axes."""
 
-    Attributes:
-        number: sequence number of the request, shared with moves.
-        answered: whether the unit acknowledged the halt.
-        done: set when the unit has acknowledged the halt, or will not.
-    """
-
-    number: int
-    answered: bool = False
-    done: threading.Event = field(default_factory=threading.Event)
+    number: int  # sequence number of the request, shared with moves
+    answered: bool = False  # whether the unit acknowledged the halt
+    done: threading.Event = field(default_factory=threading.Event)  # set when it has, or will not
 
 
 def drained(queue: deque[Request]) -> list[Request]:
@@ -314,15 +290,6 @@ class Loop:
         link: to an opened unit.
         clock: the rig's clock.
         delay: time from a command to the start of motion [s].
-
-    Attributes:
-        moves: requests to move; the newest wins.
-        halts: requests to stop; they come before moves.
-        halted: number of the newest halt that was taken out of the queue.
-        closing: set when no more requests will come.
-        rests: whether the unit acknowledged the last halt, after which nothing more is sent.
-        errors: failure of a move without a waiting caller; the next call raises it.
-        snapshot: the newest positions.
     """
 
     def __init__(self, link: HeadLink, clock: Clock, delay: float) -> None:
@@ -332,12 +299,12 @@ class Loop:
         self._polled = True  # since the last move: moves in quick succession must not displace the polls
         self._cuts = 0  # in a row, without a poll between them
         self._active: Move | None = None
-        self.moves: deque[Move] = deque()
-        self.halts: deque[Halt] = deque()
-        self.halted = 0
-        self.closing = False
-        self.rests = False
-        self.errors: deque[DeviceError] = deque(maxlen=1)
+        self.moves: deque[Move] = deque()  # the newest wins
+        self.halts: deque[Halt] = deque()  # they come before moves
+        self.halted = 0  # number of the newest halt that was taken out of the queue
+        self.closing = False  # set when no more requests will come
+        self.rests = False  # whether the unit acknowledged the last halt, after which nothing more is sent
+        self.errors: deque[DeviceError] = deque(maxlen=1)  # of a move without a waiting caller; the next call raises it
         while not all(track.polls for track in self._tracks):
             self._poll_position()
         self.snapshot = self._make_snapshot()

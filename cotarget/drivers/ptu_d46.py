@@ -57,17 +57,10 @@ class D46Settings(PolledHeadSettings):
 
 @dataclass(frozen=True)
 class UnitInfo:
-    """What a unit reports about itself.
+    """What a unit reports about itself."""
 
-    Attributes:
-        version: firmware version, in the unit's words.
-        mode: step mode, in the unit's words; empty where the firmware does not report it.
-        pan: facts of the pan axis.
-        tilt: facts of the tilt axis.
-    """
-
-    version: str
-    mode: str
+    version: str  # of the firmware, in the unit's words
+    mode: str  # step mode, in the unit's words; empty where the firmware does not report it
     pan: AxisFacts
     tilt: AxisFacts
 
@@ -95,13 +88,7 @@ def connect(line: Line) -> UnitInfo:
 
 
 class D46Link:
-    """The protocol of a PTU-D46 that `connect` has made ready, a `HeadLink`.
-
-    Attributes:
-        name: of the port.
-        hurry: returns whether a halt waits.
-        unit: what the unit reported about itself.
-    """
+    """The protocol of a PTU-D46 that `connect` has made ready, a `HeadLink`."""
 
     def __init__(self, line: Line) -> None:
         self._line, self.name = line, line.name

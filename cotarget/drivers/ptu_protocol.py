@@ -14,12 +14,15 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from cotarget.drivers.interlock import PositionLostError
-from cotarget.drivers.serial_line import Port, RefusedError, ReplyError, SerialLine, SilentError, open_port
+from cotarget.drivers.serial_line import RefusedError, ReplyError, SerialLine, SilentError, open_port
 from cotarget.errors import DeviceError
 from cotarget.rig import Clock
+
+if TYPE_CHECKING:
+    import serial
 
 log = logging.getLogger(__name__)
 
@@ -54,17 +57,11 @@ EVENT_WORDS = {"P": "pan hit its limit (!P)", "T": "tilt hit its limit (!T)", "D
 
 @dataclass(frozen=True)
 class Reply:
-    """One line from the unit, parsed.
+    """One line from the unit, parsed."""
 
-    Attributes:
-        text: text after the ``*`` or ``!``.
-        refused: whether the line is an error.
-        echo: text before the mark: the command, where the unit echoes.
-    """
-
-    text: str
-    refused: bool = False
-    echo: str = ""
+    text: str  # after the ``*`` or ``!``
+    refused: bool = False  # whether the line is an error
+    echo: str = ""  # before the mark: the command, where the unit echoes
 
 
 def command(name: str, value: int | None = None) -> bytes:
@@ -195,20 +192,15 @@ MOST_LINES = 64  # skipped in search of one answer
 
 
 class Line(SerialLine):
-    """Exchange of one command at a time with a unit.
+    """Exchange of one command at a time with a unit."""
 
-    Attributes:
-        events: "P", "T" and "D" as the unit sent them; the user of the line removes them.
-        strict: set once the unit's echo is off; from then on text before an answer is an error.
-        hurry: returns whether the head is to be halted now, so that an answer in flight gets `HURRY_S` at most.
-    """
-
-    def __init__(self, port: Port, name: str, baud: int, clock: Clock) -> None:
+    def __init__(self, port: "serial.Serial", name: str, baud: int, clock: Clock) -> None:
         super().__init__(port, name, baud, clock)
         self._buffer = b""
         self._strange = b""  # the last line that was no answer
-        self.events: list[str] = []
-        self.strict = False
+        self.events: list[str] = []  # "P", "T" and "D" as the unit sent them; the user of the line removes them
+        self.strict = False  # set once the unit's echo is off; from then on text before an answer is an error
+        # Returns whether the head is to be halted now, so that an answer in flight gets `HURRY_S` at most.
         self.hurry: Callable[[], bool] = lambda: False
 
     def ask(self, order: bytes, patience: float = QUICK_S, skipping: bool = False) -> tuple[str, float]:

@@ -54,17 +54,11 @@ def _are_two(attribute: Any, kind: type[Any]) -> bool:
 
 
 class Role(NamedTuple):
-    """What a device of a table of [hardware] has to have.
+    """What a device of a table of [hardware] has to have."""
 
-    Attributes:
-        spec: what its settings describe.
-        attributes: its attributes, and what they have to be.
-        methods: its methods, and what they have to return; None for nothing.
-    """
-
-    spec: type[Any]
-    attributes: Mapping[str, Answer]
-    methods: Mapping[str, Answer | None]
+    spec: type[Any]  # what its settings describe
+    attributes: Mapping[str, Answer]  # its attributes, and what they have to be
+    methods: Mapping[str, Answer | None]  # its methods, and what they have to return; None for nothing
 
 
 FRAME = Answer(_is_frame, "a Frame, whose image is (H, W, 3) BGR of uint8")
@@ -103,19 +97,12 @@ ROLES: Mapping[str, Role] = {
 
 @dataclass(frozen=True)
 class Device:
-    """A device of rig.toml: the driver that opens it, and its checked settings.
+    """A device of rig.toml: the driver that opens it, and its checked settings."""
 
-    Attributes:
-        role: "head", "fixed" or "zoom".
-        driver: class that opens the device; docs/drivers.md says what it has.
-        settings: an instance of ``driver.Settings``.
-        own: whether the driver is a user's own.
-    """
-
-    role: str
-    driver: Any
-    settings: Any
-    own: bool
+    role: str  # "head", "fixed" or "zoom"
+    driver: Any  # class that opens the device; docs/drivers.md says what it has
+    settings: Any  # an instance of ``driver.Settings``
+    own: bool  # whether the driver is a user's own
 
     @property
     def where(self) -> str:

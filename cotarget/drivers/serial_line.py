@@ -6,10 +6,13 @@
 import contextlib
 import errno
 import re
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.rig import Clock
+
+if TYPE_CHECKING:
+    import serial
 
 SLICE_S = 0.01  # timeout of one read; a longer wait checks its deadline with this period [s]
 WRITE_S = 0.5  # a line that takes no bytes for this time is dead [s]
@@ -46,23 +49,6 @@ class LostError(DeviceError):
         super().__init__(f"the line to the pan-tilt unit at {name} is lost ({why}); plug it in and open it again")
 
 
-class Port(Protocol):
-    """The part of pyserial's ports that the drivers use."""
-
-    @property
-    def in_waiting(self) -> int:
-        """Number of bytes that can be read without waiting."""
-
-    def read(self, size: int = 1, /) -> bytes:
-        """Read bytes, waiting until the port's own timeout."""
-
-    def write(self, data: bytes, /) -> int | None:
-        """Send bytes."""
-
-    def close(self) -> None:
-        """Release the port."""
-
-
 class SerialLine:
     """Bytes to and from a unit; used by one thread at a time.
 
@@ -79,7 +65,7 @@ class SerialLine:
         heard: the last received bytes, of any kind.
     """
 
-    def __init__(self, port: Port, name: str, baud: int, clock: Clock) -> None:
+    def __init__(self, port: "serial.Serial", name: str, baud: int, clock: Clock) -> None:
         self._port, self._clock = port, clock
         self.name, self.baud = name, baud
         self.byte_s = BITS / baud
@@ -128,7 +114,7 @@ def ports() -> list[tuple[str, str]]:
     return [(port.device, port.description) for port in list_ports.comports()]
 
 
-def open_port(name: str, baud: int) -> Port:
+def open_port(name: str, baud: int) -> "serial.Serial":
     """Open a port by pyserial's name or URL of it.
 
     Raises:

@@ -26,9 +26,8 @@ from urllib.request import parse_http_list, parse_keqv_list
 
 import numpy as np
 
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, Picture, encode_jpeg
-from cotarget.emulators.serve import LOCAL, TcpServer
+from cotarget.emulators.serve import LOCAL, Faults, TcpServer
 
 # Requests and replies
 

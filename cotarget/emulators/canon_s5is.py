@@ -25,7 +25,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, LensPlant, encode_jpeg
 from cotarget.emulators.ptpip import (
     ARRAY,
@@ -48,7 +47,7 @@ from cotarget.emulators.ptpip import (
     object_info,
     storage_info,
 )
-from cotarget.emulators.serve import LOCAL
+from cotarget.emulators.serve import LOCAL, Faults
 from cotarget.errors import CotargetError
 from cotarget.rig import Image
 

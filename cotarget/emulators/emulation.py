@@ -12,10 +12,10 @@ import tomli_w
 from cotarget.config import DEFAULT_TARGETS, RigConfig
 from cotarget.emulators.axis_241q import AXIS_FAULTS, AxisServer
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
+from cotarget.emulators.ptu_d46.ports import UnitPorts
 from cotarget.emulators.ptu_d46.unit import UnitProfile
-from cotarget.emulators.serve import LOCAL, JsonLines, UnitPorts
+from cotarget.emulators.serve import LOCAL, Closes, Faults, JsonLines
 from cotarget.emulators.world import LiveWorld
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose
@@ -39,7 +39,7 @@ class Ports:
     control: int = 0  # port for faults and ground truth
 
 
-class Emulation:
+class Emulation(Closes):
     """The emulated rig, from its construction until it is closed; a context manager.
 
     Args:
@@ -152,14 +152,6 @@ class Emulation:
     def close(self) -> None:
         """End all servers, then the world; may be called again."""
         self._opened.close()
-
-    def __enter__(self) -> "Emulation":
-        """Return the emulation itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the emulation."""
-        self.close()
 
     def _present_board(self, request: Any) -> Any:
         """Answer a request for the board."""

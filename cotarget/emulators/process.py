@@ -14,6 +14,7 @@ from typing import Any
 import tomli_w
 
 from cotarget.config import RigConfig, config_of, read_text
+from cotarget.emulators.serve import Closes
 from cotarget.errors import DeviceError
 
 READY = "connects to them"  # in the last line of output
@@ -23,7 +24,7 @@ END_S = 15.0  # time limit to end [s]
 ANSWER_S = 60.0  # time limit for an answer of the control socket [s]
 
 
-class EmulatedRig:
+class EmulatedRig(Closes):
     """`cotarget emulate` in a child process, until it is closed; a context manager.
 
     Args:
@@ -107,14 +108,6 @@ class EmulatedRig:
         self._stream.close()
         self._connection.close()
         end(self.process)
-
-    def __enter__(self) -> "EmulatedRig":
-        """Return the rig itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End the process."""
-        self.close()
 
     def _read_addresses(self) -> dict[str, str]:
         assert self.process.stdout is not None

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
 
-from cotarget.emulators.faults import Faults
-from cotarget.emulators.serve import TcpServer
+from cotarget.emulators.serve import Faults, TcpServer
 from cotarget.errors import CotargetError
 
 # PTP: values, datasets and response codes

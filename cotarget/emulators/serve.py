@@ -1,28 +1,79 @@
-"""Transports of emulated devices: TCP servers, JSON lines, and the ports of a unit on a serial line.
+"""What emulated devices share: faults that can be switched on, TCP servers, and JSON lines.
 
-`TcpServer` serves each connection on a thread of its own. `UnitPorts` serves a firmware on a pseudo-terminal, on TCP or
-on both, by one thread. `Wire` gives every byte its time on the serial line, ten bits at the baud rate, in each
-direction. Times are planned ahead of the clock, so that a thread that wakes late does not slow the line.
+`TcpServer` serves each connection on a thread of its own.
 """
 
 import contextlib
 import json
-import os
-import random
-import select
 import socket
-import termios
 import threading
-import time
-import tty
-from collections import deque
-from collections.abc import Callable
-from typing import Any, Protocol, Self
+from collections.abc import Callable, Iterable
+from typing import Any, Self
 
-from cotarget.emulators.faults import Faults
-from cotarget.errors import CotargetError, DeviceError
+from cotarget.errors import ConfigError, CotargetError, DeviceError, choices
 
 LOCAL, HIGHEST_PORT = "127.0.0.1", 65535
+
+
+class Closes:
+    """What is closed at the end of a with block."""
+
+    def close(self) -> None:
+        """Release what is held; may be called again."""
+
+    def __enter__(self) -> Self:
+        """Return the object itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the object."""
+        self.close()
+
+
+class Faults:
+    """The active faults of a device; safe to use from any thread.
+
+    Args:
+        known: names of all faults that the device has.
+    """
+
+    def __init__(self, known: Iterable[str]) -> None:
+        self._known = frozenset(known)
+        self._active = set[str]()  # no annotation: the method set hides the type
+        self._changed = threading.Condition()
+
+    def set(self, name: str, on: bool = True) -> None:
+        """Switch a fault on or off.
+
+        Raises:
+            ConfigError: the device has no such fault.
+        """
+        if name not in self._known:
+            raise ConfigError(f"unknown fault '{name}'; valid here: {choices(self._known)}")
+        with self._changed:
+            (self._active.add if on else self._active.discard)(name)
+            self._changed.notify_all()
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether a fault is on; a name that the device does not have is a bug in the device."""
+        assert name in self._known, name
+        with self._changed:
+            return name in self._active
+
+    def take(self, name: str) -> bool:
+        """Return whether a fault is on, and switch it off: for faults that happen once."""
+        with self._changed:
+            on = name in self._active
+            self._active.discard(name)
+            return on
+
+    def wait_while(self, name: str, timeout: float) -> bool:
+        """Wait until a fault is off, at most ``timeout`` [s]; return whether it is off."""
+        with self._changed:
+            return self._changed.wait_for(lambda: name not in self._active, timeout)
+
+
+# TCP servers
 
 
 def open_listener(host: str, port: int) -> socket.socket:
@@ -40,12 +91,10 @@ def open_listener(host: str, port: int) -> socket.socket:
         raise DeviceError(f"cannot listen at {host}:{port}: {reason}") from None
 
 
-# TCP servers
-
 CHECK_S = 0.05  # period of checking whether the device is absent or the server closes [s]
 
 
-class TcpServer:
+class TcpServer(Closes):
     """A TCP server that serves each connection on a thread of its own; a context manager.
 
     Args:
@@ -85,14 +134,6 @@ class TcpServer:
         self._disconnect()
         for thread in self._threads:
             thread.join()
-
-    def __enter__(self) -> Self:
-        """Return the server itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the server."""
-        self.close()
 
     def _accept(self) -> None:
         while not self.closing.is_set():
@@ -169,248 +210,3 @@ class JsonLines(TcpServer):
             return {"error": str(error)}
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             return {"error": f"not understood: {type(error).__name__}: {error}"}
-
-
-# The serial line
-
-BITS = 10  # of a byte: start, eight, stop
-
-
-class Firmware(Protocol):
-    """The device behind a serial line."""
-
-    faults: Faults
-
-    @property
-    def baud(self) -> int:
-        """Baud rate of the serial port, from the byte after the last output on."""
-
-    @property
-    def byte_delay_s(self) -> float:
-        """Pause after each sent byte [s]."""
-
-    def receive(self, data: bytes) -> None:
-        """Process bytes that arrive."""
-
-    def output(self) -> bytes:
-        """Take the bytes that are to be sent by now."""
-
-    def connected(self) -> None:
-        """Handle a new TCP client."""
-
-
-class Wire:
-    """Bytes under way between a firmware and its client, each with the arrival time of its last bit."""
-
-    def __init__(self, firmware: Firmware) -> None:
-        self._firmware = firmware
-        self._noise = random.Random(0)
-        self._baud = firmware.baud  # of the firmware's next output
-        self._in: deque[tuple[float, int, int | None]] = deque()
-        self._out: deque[tuple[float, int, int]] = deque()
-        self._in_free = self._out_free = 0.0
-
-    def feed(self, data: bytes, now: float, baud: int | None = None) -> None:
-        """Put bytes from the client on the wire now [s].
-
-        If the client's baud rate differs from the firmware's, noise arrives; None is the firmware's own.
-        """
-        for byte in data:
-            self._in_free = max(self._in_free, now) + BITS / (baud or self._firmware.baud)
-            self._in.append((self._in_free, byte, baud))
-
-    def step(self, now: float, baud: int | None = None) -> bytes:
-        """Pass to the firmware the bytes that have arrived; return those at a client with this baud rate."""
-        while self._in and self._in[0][0] <= now:
-            arrived, byte, sent_at = self._in.popleft()
-            agreed = sent_at is None or sent_at == self._firmware.baud
-            self._firmware.receive(bytes([byte]) if agreed else self._noise.randbytes(1))
-            self._collect(arrived)
-        self._collect(now)
-        due = bytearray()
-        while self._out and self._out[0][0] <= now:
-            _, byte, sent_at = self._out.popleft()
-            due += bytes([byte]) if baud in (None, sent_at) else self._noise.randbytes(1)
-        return bytes(due)
-
-    def due(self) -> float | None:
-        """Return when the next byte arrives at either end [s]; None if none is under way."""
-        return min((way[0][0] for way in (self._in, self._out) if way), default=None)
-
-    def clear(self) -> None:
-        """Drop the bytes under way, and the firmware's output."""
-        self._in.clear()
-        self._out.clear()
-        self._firmware.output()
-
-    def _collect(self, ready: float) -> None:
-        """Put the firmware's output on the wire; a change of its baud rate applies from the next output on."""
-        for byte in self._firmware.output():
-            self._out_free = max(self._out_free, ready) + BITS / self._baud + self._firmware.byte_delay_s
-            self._out.append((self._out_free, byte, self._baud))
-        self._baud = self._firmware.baud
-
-
-# Ports of a unit
-
-TICK_S = 0.005  # period of asking an idle firmware for output, and of checking whether the ports close [s]
-RECEIVE = 4096  # bytes
-SEND_TIMEOUT_S = 1.0  # a TCP client that reads nothing for this time is dropped [s]
-SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
-CODES = {baud: code for code, baud in SPEEDS.items()}
-
-
-class UnitPorts:
-    """The ports of a unit, which serve one program at a time; a context manager.
-
-    The pseudo-terminal behaves as a serial port: a client with another baud rate than the unit exchanges noise with it.
-    The TCP port is as of a serial device server. While it has a client, the pseudo-terminal is not served. A second
-    client replaces the first, because one that vanished, such as by a pulled cable, would otherwise block the unit for
-    ever. While the fault unplugged is on, there are no ports; afterwards the pseudo-terminal may have another name.
-
-    Args:
-        firmware: the unit.
-        serial: whether there is a pseudo-terminal.
-        tcp: TCP port to listen at, 0 for any free one; None for none.
-        host: address to listen at.
-
-    Raises:
-        DeviceError: the address is invalid or in use, or the machine has no pseudo-terminal left.
-    """
-
-    def __init__(self, firmware: Firmware, *, serial: bool = True, tcp: int | None = None, host: str = LOCAL) -> None:
-        self._firmware, self._wire, self._serial = firmware, Wire(firmware), serial
-        self._ends: tuple[int, int] | None = None  # emulator's and client's end; the latter stays open here too,
-        self.port = ""  # because without any open client's end the emulator's fails
-        self._listener = None if tcp is None else open_listener(host, tcp)
-        self._address = None if self._listener is None else (host, int(self._listener.getsockname()[1]))
-        self._client: socket.socket | None = None
-        try:
-            self._plug_in()
-        except OSError as error:
-            self._unplug()
-            raise DeviceError(f"no pseudo-terminal: {error.strerror}") from None
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="unit ports", daemon=True)
-        self._thread.start()
-
-    @property
-    def url(self) -> str:
-        """URL of the TCP port for pyserial and rig.toml."""
-        assert self._address is not None
-        return "socket://{}:{}".format(*self._address)
-
-    def close(self) -> None:
-        """End the thread and remove the ports."""
-        self._closing.set()
-        self._thread.join()
-
-    def __enter__(self) -> Self:
-        """Return the ports themselves."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the ports."""
-        self.close()
-
-    def _serve(self) -> None:
-        plugged = True
-        while not self._closing.is_set():
-            if "unplugged" in self._firmware.faults:
-                self._unplug()
-                plugged = False
-                self._firmware.faults.wait_while("unplugged", TICK_S)
-            elif plugged:
-                self._exchange()
-            else:
-                with contextlib.suppress(OSError, DeviceError):  # another program has the port for now
-                    self._plug_in()
-                    plugged = True
-        self._unplug()
-
-    def _plug_in(self) -> None:
-        if self._address is not None and self._listener is None:
-            self._listener = open_listener(*self._address)
-        if not self._serial:
-            return
-        master, slave = os.openpty()
-        tty.setraw(master)
-        tty.setraw(slave)
-        attributes = termios.tcgetattr(slave)
-        attributes[4] = attributes[5] = CODES[self._firmware.baud]
-        termios.tcsetattr(slave, termios.TCSANOW, attributes)
-        os.set_blocking(master, False)
-        self._ends, self.port = (master, slave), os.ttyname(slave)
-
-    def _unplug(self) -> None:
-        self._drop_client()
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-        if self._ends is not None:
-            self.port = ""
-            for end in self._ends:
-                os.close(end)
-            self._ends = None
-        self._wire.clear()
-
-    def _exchange(self) -> None:
-        """Pass on the bytes that are due, and wait for more, or for a client."""
-        now, baud = time.monotonic(), self._baud()
-        if arrived := self._wire.step(now, baud):
-            self._send(arrived)
-        due = self._wire.due()
-        timeout = TICK_S if due is None else min(max(due - time.monotonic(), 0.0), TICK_S)
-        sources = (self._listener, self._client, None if self._ends is None else self._ends[0])
-        for source in select.select([source for source in sources if source is not None], [], [], timeout)[0]:
-            if source is self._listener:
-                self._accept_client()
-            elif source is self._client:
-                self._receive()
-            elif self._ends is not None and source == self._ends[0]:
-                with contextlib.suppress(BlockingIOError):
-                    data = os.read(source, RECEIVE)
-                    if self._client is None:
-                        self._wire.feed(data, time.monotonic(), self._baud())
-
-    def _baud(self) -> int | None:
-        """Return the baud rate that the program at the pseudo-terminal has set; None for a line without one."""
-        if self._client is not None or self._ends is None:
-            return None
-        return SPEEDS.get(termios.tcgetattr(self._ends[1])[5]) or None
-
-    def _send(self, data: bytes) -> None:
-        if self._client is not None:
-            try:
-                self._client.sendall(data)
-            except OSError:  # the client is gone, or reads nothing
-                self._drop_client()
-        elif self._ends is not None:
-            with contextlib.suppress(BlockingIOError):  # without a reader a serial port loses bytes
-                os.write(self._ends[0], data)
-
-    def _receive(self) -> None:
-        assert self._client is not None
-        try:
-            data = self._client.recv(RECEIVE)
-        except OSError:
-            data = b""
-        if data:
-            self._wire.feed(data, time.monotonic())
-        else:
-            self._drop_client()
-
-    def _accept_client(self) -> None:
-        assert self._listener is not None
-        self._drop_client()
-        with contextlib.suppress(OSError):  # the client is gone already
-            self._client = self._listener.accept()[0]
-            self._client.settimeout(SEND_TIMEOUT_S)
-            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._firmware.connected()
-
-    def _drop_client(self) -> None:
-        if self._client is not None:
-            self._client.close()
-            self._client = None
-            self._wire.clear()

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 from cotarget.config import RigConfig, SimCamera
 from cotarget.emulators.plant import Feed, Picture
+from cotarget.emulators.serve import Closes
 from cotarget.errors import CotargetError, DeviceError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Image
@@ -147,7 +148,7 @@ def paced(config: RigConfig) -> RigConfig:
     return replace(config, sim=replace(sim, effects=effects, fixed=fixed, zoom=zoom))
 
 
-class LiveWorld:
+class LiveWorld(Closes):
     """The simulated world in real time; a context manager.
 
     Args:
@@ -231,14 +232,6 @@ class LiveWorld:
         for thread in self._threads:
             if thread.is_alive():
                 thread.join()
-
-    def __enter__(self) -> "LiveWorld":
-        """Return the world itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the world."""
-        self.close()
 
     def _guarded(self, run: Callable[[], None]) -> None:
         """Run a thread; its failure is passed to the constructor and to later calls of `check`."""

@@ -238,7 +238,7 @@ def test_a_lost_position_is_remembered_until_the_unit_was_reset(opened, link, tm
 
 def test_halts_from_many_threads(opened, link):
     head = opened()
-    link.stuck = True
+    link.stuck, link.meanwhile = True, lambda: wait_for(link.hurry)
     head.move(STEP, 0.0)
     threads = [threading.Thread(target=head.halt) for _ in range(5)]
     for thread in threads:

@@ -11,8 +11,8 @@ import pytest
 
 from cotarget.emulators import canon_s5is, ptpip
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isCamera, S5isServer, Shutter, Viewfinder
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed
+from cotarget.emulators.serve import Faults
 from tests.support.plants import DEADLINE_S, LensModel, decoded, plain, publish, wait_for
 
 OK, BUSY = 0x2001, 0x2019

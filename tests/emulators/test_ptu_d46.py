@@ -11,10 +11,10 @@ from dataclasses import replace
 import pytest
 import serial
 
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
+from cotarget.emulators.ptu_d46.ports import Wire
 from cotarget.emulators.ptu_d46.unit import D46_PAPER, D46_STOCK, E_SERIES, UnitProfile
-from cotarget.emulators.serve import Wire
+from cotarget.emulators.serve import Faults
 from cotarget.errors import ConfigError
 from tests.support.plants import DEADLINE_S, AxisModel, LiveUnit, wait_for
 

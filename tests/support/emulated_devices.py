@@ -63,7 +63,7 @@ class D46Unit(LiveUnit):
 S5IS = """
 import sys
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
-from cotarget.emulators.faults import Faults
+from cotarget.emulators.serve import Faults
 from tests.support.plants import Film, LensModel, plain
 
 still, lens, faults = plain((3264, 2448), 90), LensModel(), Faults(S5IS_FAULTS)

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import serial
 
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, Picture
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
+from cotarget.emulators.ptu_d46.ports import UnitPorts
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
-from cotarget.emulators.serve import UnitPorts
+from cotarget.emulators.serve import Faults
 from cotarget.errors import DeviceError
 from cotarget.sim.motion import Axis
 

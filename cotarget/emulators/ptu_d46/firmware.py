@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import AxisPlant
 from cotarget.emulators.ptu_d46.unit import (
     RefusalError,
@@ -24,6 +23,7 @@ from cotarget.emulators.ptu_d46.unit import (
     UnitProfile,
     refuse_beyond,
 )
+from cotarget.emulators.serve import Faults
 
 # Commands
 
@@ -33,22 +33,16 @@ Version = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Command:
-    """A command of the unit.
+    """A command of the unit."""
 
-    Attributes:
-        name: its letters; a small x stands for P (pan) or T (tilt).
-        argument: of what kind: `NUMBER`, other numbers as a regular expression, a choice of letters such as "[ED]", or
-            empty for a command without one.
-        alone: answers the command without argument, which mostly is a query; None where the argument is needed.
-        given: answers the command with its argument, an int where all of it is a number.
-        since: first firmware version that has it.
-    """
-
-    name: str
+    name: str  # its letters; a small x stands for P (pan) or T (tilt)
+    # `NUMBER`, other numbers as a regular expression, a choice of letters such as "[ED]", or empty for no argument.
     argument: str = ""
+    # Answers the command without argument, which mostly is a query; None where the argument is needed.
     alone: Callable[[Unit, UnitAxis], Answer] | None = None
+    # Answers the command with its argument, an int where all of it is a number.
     given: Callable[[Unit, UnitAxis, Any], Answer] | None = None
-    since: Version = (0, 0, 0)
+    since: Version = (0, 0, 0)  # first firmware version that has it
 
 
 NUMBER = r"[+-]?\d{1,9}"
@@ -320,7 +314,7 @@ D46_FAULTS = (
 class D46:
     """A PTU-D46 some time after power-up: calibrated, echoing, verbose, standing.
 
-    For one thread at a time: that of its ports (`cotarget.emulators.serve.UnitPorts`).
+    For one thread at a time: that of its ports (`cotarget.emulators.ptu_d46.ports.UnitPorts`).
 
     Args:
         pan: mechanics of pan, in the unit's steps.
