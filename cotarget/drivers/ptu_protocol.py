@@ -103,23 +103,16 @@ def parse(line: bytes) -> Reply | None:
     )
 
 
+# What answers say; each of these raises ReplyError where the text says nothing of the kind.
+
+
 def integer(text: str) -> int:
-    """Parse the number in an answer: the first integer after " is ", or the first of a terse answer.
-
-    Never the last integer of the line, which may be the 2 of "positions/sec^2".
-
-    Raises:
-        ReplyError: the answer has no integer.
-    """
+    """Parse the first integer after " is ", or of a terse answer; the last may be the 2 of "positions/sec^2"."""
     return int(_number(INTEGER, text))
 
 
 def bare_integer(text: str) -> int:
-    """Parse a terse answer that consists of one integer.
-
-    Raises:
-        ReplyError: the answer is anything else.
-    """
+    """Parse a terse answer that consists of one integer."""
     found = INTEGER.fullmatch(text)
     if found is None:
         raise ReplyError(f"{shown(text.encode())} is not a number alone")
@@ -127,11 +120,7 @@ def bare_integer(text: str) -> int:
 
 
 def arcseconds(text: str) -> float:
-    """Parse the resolution in an answer to ``PR`` or ``TR`` [seconds of arc].
-
-    Raises:
-        ReplyError: the answer has none, or it is zero.
-    """
+    """Parse the resolution in an answer to ``PR`` or ``TR`` [seconds of arc], which is above zero."""
     value = float(_number(DECIMAL, text))
     if value == 0.0:
         raise ReplyError(f"{shown(text.encode())} is no resolution")
@@ -139,11 +128,7 @@ def arcseconds(text: str) -> float:
 
 
 def done(text: str) -> None:
-    """Check that an answer to an order is the star alone; more text answers another command.
-
-    Raises:
-        ReplyError: the answer has text.
-    """
+    """Check that an answer to an order is the star alone; more text answers another command."""
     if text:
         raise ReplyError(f"{shown(text.encode())} answers something else")
 
@@ -157,11 +142,7 @@ def _number(pattern: re.Pattern[str], text: str) -> str:
 
 
 def _either(text: str, one: re.Pattern[str], other: re.Pattern[str]) -> bool:
-    """Return whether an answer matches the first pattern and not the second.
-
-    Raises:
-        ReplyError: the answer matches neither or both.
-    """
+    """Return whether an answer matches the first pattern and not the second; it must match one of them."""
     yes, no = one.search(text) is not None, other.search(text) is not None
     if yes == no:
         raise ReplyError(f"{shown(text.encode())} names neither mode")

@@ -437,9 +437,6 @@ class S5isServer(PtpIpServer):
         quality: of JPEG, 1 to 100.
         faults: must know `S5IS_FAULTS`; None for a camera without faults.
         shutter_s: from the request of a still to its exposure, mostly focusing [s].
-
-    Raises:
-        DeviceError: the address is invalid or in use.
     """
 
     def __init__(

@@ -96,6 +96,3 @@ class LensPlant(Protocol):
 
     def position(self) -> int:
         """Return the present position."""
-
-    def moving(self) -> bool:
-        """Return whether the lens moves, or is about to."""

@@ -33,14 +33,6 @@ class EmulatedRig(Closes):
         options: further ones of the command.
         environment: further variables, such as COTARGET_PASSWORD.
 
-    Attributes:
-        folder: of its files.
-        sim: configuration of the simulated rig.
-        sim_toml: the simulated rig's rig.toml.
-        hardware_toml: the rig.toml that connects to the emulation.
-        addresses: what the command printed, by the first word of the line.
-        process: the child.
-
     Raises:
         DeviceError: the process does not start.
     """
@@ -49,6 +41,7 @@ class EmulatedRig(Closes):
         self, folder: Path, tables: Mapping[str, Any], *options: str, environment: Mapping[str, str] | None = None
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
+        # The rig.toml of the simulated rig, and the one that connects to the emulation.
         self.folder, self.sim_toml, self.hardware_toml = folder, folder / "sim.toml", folder / "hardware.toml"
         self.sim_toml.write_text(tomli_w.dumps(dict(tables)), encoding="utf-8")
         self.sim: RigConfig = config_of(read_text(self.sim_toml), self.sim_toml)
@@ -68,7 +61,7 @@ class EmulatedRig(Closes):
         late = threading.Timer(START_S, self.process.kill)  # its output ends then
         late.start()
         try:
-            self.addresses = self._read_addresses()
+            self.addresses = self._read_addresses()  # by the first word of the line
             host, _, port = self.addresses["control"].removeprefix("socket://").rpartition(":")
             self._connection = socket.create_connection((host, int(port)), ANSWER_S)
             self._stream = self._connection.makefile("rw", encoding="utf-8")

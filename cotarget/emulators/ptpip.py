@@ -343,9 +343,6 @@ class PtpIpServer(TcpServer):
         absent: returns whether the device is unplugged or off now, which closes the port.
         host: address to listen at.
         port: to listen at; 0 for any free port.
-
-    Raises:
-        DeviceError: the address is invalid or in use.
     """
 
     def __init__(

@@ -189,9 +189,6 @@ class JsonLines(TcpServer):
             {"error": ...}.
         host: address to listen at.
         port: to listen at; 0 for any free port.
-
-    Raises:
-        DeviceError: the address is invalid or in use.
     """
 
     def __init__(self, answer: Callable[[Any], Any], host: str = LOCAL, port: int = 0) -> None:

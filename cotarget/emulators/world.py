@@ -98,7 +98,6 @@ class EmulatedLens:
 
     def __init__(self, drive: LensDrive, clock: WallClock, delay: float) -> None:
         self._drive, self._clock, self._delay = drive, clock, delay
-        self._stops_at = 0.0
         self._lock = threading.Lock()
 
     @property
@@ -110,15 +109,11 @@ class EmulatedLens:
         """Start a move to a position."""
         with self._lock:
             t = self._clock.now() + self._delay
-            self._stops_at = self._drive.axis.command(t, float(min(max(position, 0), self.last)))
+            self._drive.axis.command(t, float(min(max(position, 0), self.last)))
 
     def position(self) -> int:
         """Return the present position."""
         return round(self._drive.axis.motor(self._clock.now())[0])
-
-    def moving(self) -> bool:
-        """Return whether the lens moves, or is about to."""
-        return self._clock.now() < self._stops_at
 
 
 # The world

@@ -230,24 +230,6 @@ def test_a_snapshot_has_both_axes_at_one_time(bench):
         assert seen.tilt == pytest.approx((tilt - seen.t) * 1000, abs=1.5)
 
 
-def test_the_line_is_busy_all_the_time(bench):
-    bench.start()
-    bench.port.sent.clear()
-    start = bench.clock.now()
-    bench.run(1.0)
-    # "PP " and "* 0" with CR LF: eight bytes each.
-    assert len(bench.port.sent) >= 0.98 * (bench.clock.now() - start) / (8 * BYTE)
-
-
-def test_a_command_is_on_the_wire_soon(bench):
-    """A poll in flight, of 16 bytes, and the speeds of both axes with their answers, 9 bytes each, come before it."""
-    bench.start()
-    start = bench.clock.now()
-    bench.move(1000, 0)
-    bench.run(0.2)
-    assert next(t for t, data in bench.port.sent if data == b"PP1000 ") - start <= (16 + 2 * 10) * BYTE + 0.005
-
-
 # Moves
 
 

@@ -98,9 +98,6 @@ class LensModel:
     def position(self):
         return self._position
 
-    def moving(self):
-        return False
-
 
 class Film:
     """Publishes images at a steady rate, as a camera does; a context manager.
