@@ -21,8 +21,7 @@ from cotarget.drivers import axis, frame_buffer
 from cotarget.drivers.axis import AxisCamera, AxisSettings, LoginError
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
-from tests.support.emulated_devices import FEED_SIZE, PASSWORD, USER, axis_server
-from tests.support.plants import wait_for
+from tests.support.plants import FEED_SIZE, PASSWORD, USER, axis_server, wait_for
 
 pytestmark = pytest.mark.wire
 PARAM, STATUS, VIDEO = "/axis-cgi/param.cgi", "/axis-cgi/videostatus.cgi", "/axis-cgi/mjpg/video.cgi"

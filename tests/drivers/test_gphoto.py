@@ -12,7 +12,7 @@ from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.gphoto import GphotoLink, LinkError, cameras, full_port
 from cotarget.drivers.gphoto_camera import GphotoCamera, GphotoSettings
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError
-from tests.support.emulated_devices import s5is_process
+from tests.support.plants import s5is_process
 
 DEADLINE_S = 20.0  # for whatever should happen at once: only a hang takes as long
 ROOT = Path(__file__).parents[2]

@@ -24,24 +24,17 @@ from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import pose
 from cotarget.sim.motion import HISTORY_S, Axis, HeadDrive, LensDrive
 from tests.support.plants import DEADLINE_S, wait_for
+from tests.support.simulated_clock import SimClock
 
 STEP = math.radians(0.05)  # [rad]
 DELAY = 0.04  # from a command to motion [s]
 
 
-class FakeClock:
-    """Shows what the test says."""
-
-    def __init__(self):
-        self.t = 0.0
-
-    def now(self):
-        return self.t
-
-
 @pytest.fixture
 def clock():
-    return FakeClock()
+    clock = SimClock()
+    clock.t = 0.0
+    return clock
 
 
 def axis(clock, step=STEP, **more):

@@ -21,9 +21,9 @@ from cotarget.recording.recorder import Recorder
 from cotarget.recording.replay import Replay
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
-from tests.support.emulated_devices import FEED_SIZE, PASSWORD, USER, D46Unit, axis_server, s5is_process
 from tests.support.gphoto_link import CONFIG as GPHOTO_CONFIG
 from tests.support.gphoto_link import FakeLink
+from tests.support.plants import FEED_SIZE, PASSWORD, USER, D46Unit, axis_server, s5is_process
 from tests.support.recorded_run import calibration_file
 
 CONFIG = parse_config({"sim": {"scene": "indoor", "targets": ["book"]}})

@@ -1,13 +1,21 @@
-"""Axes, lenses and images for emulated devices, without a simulated world; and a PTU-D46 with such axes."""
+"""Emulated devices without a simulated world: axes, lenses and images, and each device with such behind it."""
 
+import contextlib
 import math
+import os
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import serial
 
+from cotarget.drivers.ptu_d46 import D46Settings
+from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.plant import Feed, Picture
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.ports import UnitPorts
@@ -16,6 +24,8 @@ from cotarget.emulators.serve import Faults
 from cotarget.errors import DeviceError
 from cotarget.sim.motion import Axis
 
+FEED_SIZE = (320, 240)
+USER, PASSWORD = "root", "hunter2 & co"
 DEADLINE_S = 20.0  # of real time: a loaded machine has reached it only if something hangs
 
 
@@ -76,6 +86,25 @@ class LiveUnit:
     def open(self, tcp=False):
         """Open a port as pyserial does."""
         return serial.serial_for_url(self.ports.url if tcp else self.ports.port, timeout=DEADLINE_S)
+
+
+class D46Unit(LiveUnit):
+    """An emulated unit behind a paced pseudo-terminal or TCP; a context manager.
+
+    Attributes:
+        config: settings of the driver that connects to it, with pan in the unit's own sense.
+    """
+
+    def __init__(self, profile=D46_STOCK, tcp=False):
+        super().__init__(profile, serial=not tcp, tcp=0 if tcp else None)
+        step = profile.step / 3600
+        self.config = D46Settings(
+            port=self.ports.url if tcp else self.ports.port,
+            step_deg=step,
+            pan_deg=tuple(step * end for end in profile.pan),
+            tilt_deg=tuple(step * end for end in profile.tilt),
+            pan_sign=1,
+        )
 
 
 class LensModel:
@@ -164,3 +193,80 @@ def fails(call):
             return str(error)
         time.sleep(1e-3)
     raise AssertionError("it goes on and on")
+
+
+# The Axis video server
+
+
+@contextlib.contextmanager
+def axis_server(auth="digest"):
+    """A 241Q whose input shows a new picture 25 times a second, which has noise like a camera's."""
+    rng = np.random.default_rng(0)
+    scene = cv2.resize(rng.integers(0, 255, (15, 20, 3), dtype=np.uint8), FEED_SIZE, interpolation=cv2.INTER_CUBIC)
+
+    def draw(index):
+        return cv2.add(scene, rng.integers(0, 5, scene.shape, dtype=np.uint8))
+
+    with Film(draw) as film, AxisServer({1: film.feed}, user=USER, password=PASSWORD, auth=auth) as server:
+        yield server
+
+
+# The Canon PowerShot S5 IS: in a process of its own, because libgphoto2 would hold up its threads
+
+S5IS = """
+import sys
+from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
+from cotarget.emulators.serve import Faults
+from tests.support.plants import Film, LensModel, plain
+
+still, lens, faults = plain((3264, 2448), 90), LensModel(), Faults(S5IS_FAULTS)
+with (
+    Film(lambda index: plain((640, 480), 20 + index % 200), 0.05) as film,
+    S5isServer(film.feed, lambda: still, lens, faults=faults) as server,
+):
+    print(server.port, flush=True)
+    for line in sys.stdin:
+        if line.strip():
+            name, on = line.split()
+            faults.set(name, on == "on")
+        print(lens.position(), flush=True)
+"""
+
+
+class S5isProcess:
+    """The emulated camera's process.
+
+    Attributes:
+        port: port of the camera, as gphoto2 writes it.
+    """
+
+    def __init__(self, process):
+        self._process = process
+        self.port = f"ptpip:localhost:{int(process.stdout.readline())}"
+
+    def switch(self, fault, on=True):
+        """Switch a fault on or off."""
+        self._ask(f"{fault} {'on' if on else 'off'}")
+
+    def lens(self):
+        """Where the lens is."""
+        return int(self._ask(""))
+
+    def _ask(self, text):
+        print(text, file=self._process.stdin, flush=True)
+        return self._process.stdout.readline()
+
+
+@contextlib.contextmanager
+def s5is_process():
+    """An emulated S5 IS, whose pictures are even and never the same, and whose stills have 90 grey levels."""
+    pytest.importorskip("gphoto2")
+    path = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", S5IS], env=os.environ | path, **pipes) as process:
+        try:
+            yield S5isProcess(process)
+            process.stdin.close()
+            process.wait(DEADLINE_S)
+        finally:
+            process.kill()
