@@ -22,7 +22,6 @@ from cotarget.errors import CotargetError
 # PTP: values, datasets and response codes
 
 PARAMETERS = 5  # most parameters of an operation or a response
-LONGEST_STRING = 255  # UTF-16 units, with the closing zero
 ARRAY = 0x4000  # set in the data type of an array
 UINT8, UINT16, UINT32, STRING = 2, 4, 6, 0xFFFF  # data types
 WIDTHS = {UINT8: 1, UINT16: 2, UINT32: 4}  # bytes
@@ -80,8 +79,7 @@ def string(text: str) -> bytes:
     """Encode a string after its length; an empty one is a length of 0."""
     if not text:
         return b"\0"
-    units = text.encode("utf-16-le")[: 2 * (LONGEST_STRING - 1)] + b"\0\0"
-    return bytes([len(units) // 2]) + units
+    return bytes([len(text) + 1]) + f"{text}\0".encode("utf-16-le")
 
 
 def encode(kind: int, value: Value) -> bytes:
@@ -271,7 +269,6 @@ LINE_FAULTS = ("hung", "slow", "cut")
 SLOW_S = 1.0  # delay of a slow answer; libgphoto2 waits for 2.5 s [s]
 HANDOVER_S = 1.0  # time limit for a new initiator to wait for the end of the one before [s]
 RECEIVE = 1 << 16  # bytes
-LONGEST_DATA = 1 << 20  # most data of an operation; a property's value takes a few bytes [bytes]
 SENDS_DATA = 2  # in the data phase field of a request
 # libgphoto2 sends a request and its data separately and without TCP_NODELAY. Unless the first is acknowledged at once,
 # which is an option of Linux, the second leaves 40 ms late.
@@ -303,18 +300,13 @@ class CommandSession:
                 self._waits, self._total, self._data = phase == SENDS_DATA, -1, b""
                 return [] if self._waits else self._operate()
             case Kind.START_DATA if self._waits and self._total < 0:
-                transaction, self._total = unpack("IQ", body)
-                if transaction != self._transaction or self._total > LONGEST_DATA:
-                    raise PtpError(f"PTP/IP: {self._total} bytes are too much data, or another transaction's")
+                _, self._total = unpack("IQ", body)
             case Kind.DATA | Kind.END_DATA if self._waits and self._total >= 0:
-                (transaction,) = unpack("I", body[:4])
-                self._data += body[4:]
-                if transaction != self._transaction or len(self._data) > self._total:
-                    raise PtpError(f"PTP/IP: more data than {self._total} bytes, or another transaction's")
+                self._data += body[4:]  # after the number of the transaction
                 if kind == Kind.END_DATA:
                     self._waits = False
-                    if len(self._data) < self._total:
-                        return [response(Code.INCOMPLETE_TRANSFER, transaction)]
+                    if len(self._data) != self._total:
+                        return [response(Code.INCOMPLETE_TRANSFER, self._transaction)]
                     return self._operate()
             case Kind.PROBE_REQUEST if not body:
                 return [packet(Kind.PROBE_RESPONSE)]
