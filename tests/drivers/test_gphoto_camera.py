@@ -12,7 +12,6 @@ import threading
 from concurrent.futures import Future
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -272,21 +271,6 @@ def test_a_viewfinder_fault_is_named_and_recovered_from(name):
     bench.run(2.0)
     assert bench.frames[-1].t > newest.t
     assert bench.buffer.waited_s < 2 * PERIOD
-
-
-# Exif with one entry: orientation 6, to be shown turned by a quarter.
-TIFF = bytes.fromhex("4d4d002a 00000008 0001 0112 0003 00000001 0006 0000 00000000")
-EXIF = b"\xff\xe1" + (2 + 6 + len(TIFF)).to_bytes(2, "big") + b"Exif\0\0" + TIFF
-GREY_50 = jpeg(SIZE, 50)
-TURNED = GREY_50[:2] + EXIF + GREY_50[2:]
-
-
-@pytest.mark.parametrize("data", [GREY_50 + bytes(30), TURNED], ids=["padding", "turned"])
-def test_padding_and_the_orientation_change_nothing(data):
-    assert cv2.imdecode(np.frombuffer(TURNED, np.uint8), cv2.IMREAD_COLOR).shape == (32, 24, 3)  # OpenCV believes it
-    bench = Bench(prepare=changed(frozen=data))
-    assert bench.newest().image.shape == (24, 32, 3)
-    assert np.abs(bench.newest().image - 50.0).max() <= GREY
 
 
 # The lens

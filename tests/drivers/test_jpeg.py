@@ -135,10 +135,17 @@ def test_a_header_that_asks_for_gigabytes_is_refused():
         decode_jpeg(jpeg[:at] + (65000).to_bytes(2) * 2 + jpeg[at + 4 :])
 
 
-def test_what_follows_a_picture_and_what_fills_it_up_do_no_harm():
+# Exif with one entry: orientation 6, to be shown turned by a quarter.
+TIFF = bytes.fromhex("4d4d002a 00000008 0001 0112 0003 00000001 0006 0000 00000000")
+EXIF = b"\xff\xe1" + (2 + 6 + len(TIFF)).to_bytes(2, "big") + b"Exif\0\0" + TIFF
+
+
+def test_what_follows_a_picture_what_fills_it_up_and_its_orientation_change_nothing():
     """Fill bytes before a marker are T.81's, B.1.1.2; zeros after the end are some cameras'."""
     jpeg = picture((64, 48), 0)
-    for more in (jpeg + bytes(100), jpeg + jpeg, jpeg[:-2] + b"\xff\xff\xff" + jpeg[-2:]):
+    turned = jpeg[:2] + EXIF + jpeg[2:]
+    assert opencv(turned).shape == (64, 48, 3)  # OpenCV believes it
+    for more in (jpeg + bytes(100), jpeg + jpeg, jpeg[:-2] + b"\xff\xff\xff" + jpeg[-2:], turned):
         np.testing.assert_array_equal(decode_jpeg(more), opencv(jpeg))
 
 

@@ -319,7 +319,7 @@ def test_a_link_that_hangs_holds_up_neither_a_halt_nor_the_end(opened, link, mon
     head.close()
     assert "does not end" in caplog.text
     release.set()
-    wait_for(lambda: not head._thread.is_alive())
+    wait_for(lambda: not any(thread.name.startswith("head at") for thread in threading.enumerate()))
 
 
 # What ends a start: settings, safety, the link's attributes, and the key or text of the error.
