@@ -12,7 +12,6 @@ import re
 import socket
 import threading
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import unquote, urlsplit
@@ -37,8 +36,6 @@ STREAM_PATH = "/axis-cgi/mjpg/video.cgi"
 AXIS = "AXIS"  # the brand that an Axis reports
 # On a local network a running device accepts a connection within milliseconds [s].
 CONNECT_S = 2.0
-# Limits of a text answer [bytes], [pieces]: a device may send a text without end, byte by byte.
-LONGEST_TEXT, MOST_PIECES = 65536, 64
 # Longest quotation of a device's text in a message [characters].
 LONGEST_QUOTE = 60
 # A stream has stalled after this time without a byte [s], or after this many frame periods where that is longer.
@@ -90,14 +87,6 @@ class AxisSettings:
 
 class LoginError(StreamRefusedError):
     """The server refuses the user or the password."""
-
-
-@dataclass(frozen=True)
-class Stream:
-    """An open stream: the boundary that its header announces, and its bytes as they arrive."""
-
-    boundary: str | None
-    pieces: Iterator[bytes]
 
 
 class VideoServer:
@@ -197,8 +186,8 @@ class VideoServer:
         return ", ".join(parts)
 
     @contextlib.contextmanager
-    def stream(self, api: str = "") -> Iterator[Stream]:
-        """Open the image stream for the length of a with block.
+    def stream(self, api: str = "") -> Iterator[tuple[str | None, Iterator[bytes]]]:
+        """Open the image stream for the length of a with block: its header's boundary, and its bytes as they arrive.
 
         Args:
             api: version of the HTTP interface, where the server reports it.
@@ -219,7 +208,7 @@ class VideoServer:
             kind = response.headers.get("content-type", "")
             if response.status_code != 200 or not kind.lower().strip().startswith("multipart/"):
                 raise self._refusal(response)
-            yield Stream(boundary_of(kind), self.pieces(response))
+            yield boundary_of(kind), self.pieces(response)
 
     def _parameters(self, path: str, group: str) -> dict[str, str] | None:
         """List a group of parameters, names without "root."; {} where there are none, None where access is refused."""
@@ -292,13 +281,8 @@ class VideoServer:
             return self.read(response) if response.status_code == 200 else ""
 
     def read(self, response: "httpx.Response") -> str:
-        """Read the text of a response, cut at `LONGEST_TEXT` bytes."""
-        text = bytearray()
-        for piece, _ in zip(self.pieces(response), range(MOST_PIECES), strict=False):
-            text += piece
-            if len(text) > LONGEST_TEXT:
-                break
-        return text[:LONGEST_TEXT].decode("latin-1")
+        """Read the text of a response."""
+        return b"".join(self.pieces(response)).decode("latin-1")
 
     def pieces(self, response: "httpx.Response") -> Iterator[bytes]:
         """Yield the bytes of a response as they arrive."""
@@ -447,16 +431,16 @@ class AxisCamera(BufferedCamera):
     def _stream(self) -> None:
         """Open the stream and take its images until it ends."""
         self._open = False
-        with self._server.stream(self._api) as stream:
+        with self._server.stream(self._api) as (boundary, pieces):
             self._open = True
             self._frames.opened()
-            self._drain(stream)
+            self._drain(MultipartReader(boundary), pieces)
 
-    def _drain(self, stream: Stream) -> None:
-        reader, broken = MultipartReader(stream.boundary), 0
+    def _drain(self, reader: MultipartReader, pieces: Iterator[bytes]) -> None:
+        broken = 0
         fruitful = self._clock.now()
         try:
-            for piece in stream.pieces:
+            for piece in pieces:
                 now = self._clock.now()
                 self._frames.heard()
                 pictures = reader.feed(piece, now)

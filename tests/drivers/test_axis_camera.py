@@ -218,10 +218,7 @@ def test_the_stream_is_asked_for_as_configured(server):
     assert server.requests[-1].query == {"camera": "1", "compression": "30", "fps": "25"}
 
 
-ENDLESS = reply(body=bytes(200_000))
-
-
-@pytest.mark.parametrize(("path", "page"), [(PARAM, NOT_FOUND), (STATUS, NOT_FOUND), (PARAM, ENDLESS)])
+@pytest.mark.parametrize(("path", "page"), [(PARAM, NOT_FOUND), (STATUS, NOT_FOUND)])
 def test_a_server_that_tells_nothing_of_itself_is_taken_as_it_is(server, path, page):
     server.pages[path] = page
     with opened(server) as camera:
