@@ -399,6 +399,7 @@ def test_a_byte_of_noise_at_the_unit_does_not_keep_it_from_a_halt(bench, when):
             bench.loop.stop_for_good(DeviceError("closed"))
             assert bench.loop.rests
     assert not bench.unit.turning()
+    assert "xH" not in bench.unit.heard
 
 
 def test_a_halt_does_not_wait_for_a_silent_unit(bench):
