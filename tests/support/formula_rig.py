@@ -17,6 +17,7 @@ from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.motion import Axis
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
 from tests.support.rigs import rig_of
+from tests.support.simulated_clock import RigClock
 
 RATE_HZ = 24.0  # neither 0.4 s nor 0.8 s is a whole number of frames
 FRAME_S = 1 / RATE_HZ
@@ -52,7 +53,7 @@ class FormulaRig:
     def __post_init__(self):
         self.pan, self.tilt = (Axis(self.limits.speed, self.limits.acceleration) for _ in range(2))
         self.focal = self.focal_before = self.focal_range[0]
-        self.fixed, self.zoom, self.head, self.clock = _Camera(self), _Zoom(self), _Head(self), _Clock(self)
+        self.fixed, self.zoom, self.head, self.clock = _Camera(self), _Zoom(self), _Head(self), RigClock(self)
 
     def pose(self, t):
         return self.pan.motor(t)[0], self.tilt.motor(t)[0]
@@ -120,17 +121,6 @@ class _Head:
             axis.command(rig.t + rig.delay_s, q, fastest)
         rig.moves.append((rig.t, *goal, speed))
         return tuple(goal)
-
-
-@dataclass
-class _Clock:
-    rig: FormulaRig
-
-    def now(self):
-        return self.rig.t
-
-    def sleep_until(self, t):
-        self.rig.t = max(self.rig.t, t)
 
 
 class Seer:

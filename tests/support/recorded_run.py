@@ -24,6 +24,7 @@ from cotarget.recording.recorder import Recorder
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from tests.support.rigs import guarded, rig_of
+from tests.support.simulated_clock import RigClock
 
 SIZE = (96, 72)
 RATE_HZ, ZOOM_RATE_HZ = 25.0, 10.0
@@ -49,7 +50,7 @@ class ToyDevices:
         self.fixed = ToyCamera(self, "fixed", RATE_HZ)
         self.zoom = ToyZoomCamera(self, "zoom", ZOOM_RATE_HZ)
         self.head = ToyHead(self)
-        self.clock = ToyClock(self)
+        self.clock = RigClock(self, TICK)
         self.board = ToyBoard()
 
     def count(self, call):
@@ -127,18 +128,6 @@ class ToyHead:
     def halt(self):
         self.rig.count("head.halt")
         self.rig.goal = self.rig.pose()
-
-
-class ToyClock:
-    def __init__(self, rig):
-        self.rig = rig
-
-    def now(self):
-        self.rig.t += TICK
-        return self.rig.t
-
-    def sleep_until(self, t):
-        self.rig.t = max(self.rig.t, t)
 
 
 class ToyBoard:

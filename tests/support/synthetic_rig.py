@@ -16,6 +16,7 @@ from cotarget.geometry import RigidTransform
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Stop, Truth
 from tests.support.rigs import rig_of
+from tests.support.simulated_clock import RigClock
 
 PERIOD = 0.04
 LATENCY = 0.05
@@ -130,7 +131,7 @@ class SyntheticRig:
         self.placed = [(-1.0, None)]
         self.frames = 0
         self.fixed, self.zoom = _Camera(self, "fixed"), _Zoom(self, "zoom")
-        self.head, self.clock, self.board = _Head(self), _Clock(self), _Board(self)
+        self.head, self.clock, self.board = _Head(self), RigClock(self), _Board(self)
         self.spec, self.config = rig_of(self).spec, None
 
     def image(self, camera, t):
@@ -237,17 +238,6 @@ class _Head:
 
     def halt(self):
         pass
-
-
-@dataclass
-class _Clock:
-    rig: SyntheticRig
-
-    def now(self):
-        return self.rig.t
-
-    def sleep_until(self, t):
-        self.rig.t = max(self.rig.t, t)
 
 
 @dataclass
