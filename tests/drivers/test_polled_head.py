@@ -129,6 +129,7 @@ def test_closing_sends_a_last_halt_before_the_port_is_closed(opened, link):
     head = opened()
     head.halt()
     head.close()
+    head.halt()
     assert link.sent == ["halt", "last halt", "closed"]
     for call in (head.state, lambda: head.move(0.0, 0.0)):
         with pytest.raises(DeviceError, match="COUNTER is closed"):
