@@ -119,7 +119,6 @@ class EmulatedLens:
 # The world
 
 FIXED_HZ, ZOOM_HZ = 15.0, 10.0  # frame rates that one core renders, with a client on another core
-OLDEST_S = 4.0  # age of the oldest exposure that is rendered, after the program was suspended [s]
 STILL_TIMEOUT = 5.0  # [s]
 START_TIMEOUT = 60.0  # time limit to compile the world and open OpenGL on a slow machine [s]
 STILL_INDEX = 1_000_000_000  # first frame index of stills, whose noise must differ from the stream's
@@ -259,9 +258,7 @@ class LiveWorld(Closes):
             except queue.Empty:
                 pass
             else:
-                image = self._expose(world, "zoom", next(numbers), still.t)
-                if image is not None:
-                    still.answer.put(image)
+                still.answer.put(world.expose("zoom", next(numbers), still.t))
                 continue
             name = min(next_index, key=lambda n: next_index[n] / cameras[n].rate_hz)
             index, rate = next_index[name], cameras[name].rate_hz
@@ -270,24 +267,10 @@ class LiveWorld(Closes):
             if wait > 0:
                 self._ended.wait(min(wait, CHECK_S))
                 continue
-            image = self._expose(world, name, index, t)
-            if image is not None:
-                due = t + (cameras[name].latency_s if latency else 0.0)
-                self._due.put((due, name, Picture(image, index, self.clock.monotonic(t))))
+            picture = Picture(world.expose(name, index, t), index, self.clock.monotonic(t))
+            self._due.put((t + (cameras[name].latency_s if latency else 0.0), name, picture))
             # A world that cannot keep up drops frames; those that it publishes have their true times.
             next_index[name] = max(index + 1, math.ceil(self.clock.now() * rate - 1))
-
-    def _expose(self, world: SimWorld, name: CameraName, index: int, t: float) -> Image | None:
-        """Render a camera's image at a time [s]; None if the motion at that time is not stored any more."""
-        try:
-            return None if self._is_forgotten(t) else world.expose(name, index, t)
-        except Exception:
-            if self._is_forgotten(t):  # meanwhile
-                return None
-            raise
-
-    def _is_forgotten(self, t: float) -> bool:
-        return self.clock.now() - t > OLDEST_S
 
     def _publish(self) -> None:
         """Publish images when they are due."""

@@ -12,18 +12,16 @@ from cotarget.config import RigConfig, SimConfig, parse_config
 from cotarget.emulators.serve import JsonLines
 from cotarget.emulators.world import (
     FIXED_HZ,
-    OLDEST_S,
     ZOOM_HZ,
     EmulatedAxis,
     EmulatedLens,
     LiveWorld,
-    WallClock,
     paced,
 )
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import pose
-from cotarget.sim.motion import HISTORY_S, Axis, HeadDrive, LensDrive
-from tests.support.plants import DEADLINE_S, wait_for
+from cotarget.sim.motion import Axis, HeadDrive, LensDrive
+from tests.support.plants import DEADLINE_S, fails
 from tests.support.simulated_clock import SimClock
 
 STEP = math.radians(0.05)  # [rad]
@@ -158,88 +156,33 @@ def test_a_world_that_cannot_be_made_says_why():
 
 
 class FakeWorld:
-    """In the place of the simulated one: it shows black, and does to an exposure what the test says."""
+    """In the place of the simulated one: it shows black until its memory is full."""
 
-    closed = 0
+    full = closed = False
 
     def __init__(self, config, clock):
         self.head_drive = HeadDrive(Axis(1.0, 1.0), Axis(1.0, 1.0))
         self.lens_drive = LensDrive(667.0, 8000.0, 128, True, Axis(129.0, math.inf))
 
     def expose(self, name, index, t):
-        FakeWorld.act(t)
-        self.head_drive.angles_at(t)
+        if FakeWorld.full:
+            raise MemoryError("no more")
         return np.zeros((4, 4, 3), np.uint8)
 
     def close(self):
-        FakeWorld.closed += 1
-
-
-class SleepyClock(WallClock):
-    """A clock that can go on by some time at once, as after a machine's sleep."""
-
-    slept = 0.0
-
-    def now(self):
-        return super().now() + self.slept
-
-
-@pytest.fixture
-def fake(monkeypatch):
-    monkeypatch.setattr("cotarget.emulators.world.SimWorld", FakeWorld)
-    monkeypatch.setattr("cotarget.emulators.world.WallClock", SleepyClock)
-    monkeypatch.setattr(FakeWorld, "act", lambda t: None, raising=False)
-    monkeypatch.setattr(FakeWorld, "closed", 0)
-    return FakeWorld
-
-
-def no_memory(*_):
-    raise MemoryError("no more")
-
-
-def has_failed(world):
-    try:
-        world.check()
-    except DeviceError:
-        return True
-    return False
+        FakeWorld.closed = True
 
 
 @pytest.mark.wire
-def test_a_later_failure_of_the_world_is_raised_by_its_methods(fake):
+def test_a_later_failure_of_the_world_is_raised_by_its_methods(monkeypatch):
+    monkeypatch.setattr("cotarget.emulators.world.SimWorld", FakeWorld)
     with LiveWorld(RigConfig()) as world:
         world.check()
         assert world.still().shape == (4, 4, 3)
-        fake.act = no_memory
-        wait_for(lambda: has_failed(world))
+        FakeWorld.full = True
         for call in (world.check, world.still):
-            with pytest.raises(DeviceError, match=r"the simulated world failed: MemoryError\('no more'\)"):
-                call()
-    assert fake.closed == 1
-
-
-@pytest.mark.wire
-def test_the_world_continues_after_the_machine_was_suspended(fake):
-    """The machine sleeps during an exposure, and the head's next command drops the motion at that time."""
-    exposing, awake, moments = threading.Event(), threading.Event(), []
-
-    def act(t):
-        moments.append(t)
-        exposing.set()
-        assert awake.wait(DEADLINE_S)
-
-    with LiveWorld(RigConfig()) as world:
-        world.pan.command(10, 1000, 1000)
-        fake.act = act
-        assert exposing.wait(DEADLINE_S)
-        world.clock.slept = 4 * HISTORY_S
-        world.pan.command(0, 1000, 1000)
-        awake.set()
-        after = world.clock.now()
-        wait_for(lambda: moments[-1] > after)
-        world.check()
-    assert moments[0] < after - OLDEST_S
-    assert not [t for t in moments[1:] if t < after - OLDEST_S]
+            assert fails(call) == "the simulated world failed: MemoryError('no more')"
+    assert FakeWorld.closed
 
 
 @pytest.mark.wire
