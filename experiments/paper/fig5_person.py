@@ -16,15 +16,14 @@ from annotated_types import Gt
 
 from cotarget.calibration import Calibration
 from cotarget.config import DetectorName
-from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
 from cotarget.evaluation import add_row
 from cotarget.metrics import Row as Judged
 from cotarget.metrics import score
 from cotarget.pipeline import FollowSettings, Step
-from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Pictured, Row
 from experiments.following.field import OwnRigInField, calibrated, watched_in
+from experiments.following.wide_view import WideView, open_on, record
 from experiments.paper.panels import laid_out
 from experiments.paper.paper_loop import OURS, WAYS, picture_name
 from experiments.tables import grouped, outside, spread
@@ -65,15 +64,18 @@ def one(settings: PersonSettings, seed: int) -> Pictured:
     """Follow a person by each method; give a row per method, and pictures of the first seed."""
     rows: list[Row] = []
     pictures: dict[str, bytes] = {}
+    views: dict[str, WideView] = {}  # by detector: both methods see the same frames, which are rendered once
     for way in WAYS:
-        row, moments = _followed(calibrated(settings), settings, seed, way)
+        row, moments = _followed(calibrated(settings), settings, seed, way, views)
         rows.append(row)
         if seed == settings.seed_base:
             pictures[picture_name("fig5", way)] = _picture(moments)
     return Pictured(rows, pictures)
 
 
-def _followed(calibration: Calibration, settings: PersonSettings, seed: int, way: str) -> tuple[Row, list[Step]]:
+def _followed(
+    calibration: Calibration, settings: PersonSettings, seed: int, way: str, views: dict[str, WideView]
+) -> tuple[Row, list[Step]]:
     """Follow a person; give the figures and some moments."""
     config = settings.config("indoor", (NAME,), seed)
     found_by = settings.detector if way == OURS else "mog2"
@@ -83,7 +85,9 @@ def _followed(calibration: Calibration, settings: PersonSettings, seed: int, way
     moments: list[Step] = []
     # The last step comes a frame before the end, or later.
     due = np.linspace(FIRST_S, settings.seconds - 1 / config.sim.fixed.rate_hz, MOMENTS).tolist()
-    detector, world = make_detector(target, config.sim.fixed.rate_hz), SimWorld(config)
+    if found_by not in views:
+        views[found_by] = record(config, target, settings.seconds)
+    world, detector = open_on(views[found_by], config, closed_loop=True)
     for step, truth in watched_in(world, detector, calibration, target, settings.seconds, how, WAYS[way]):
         add_row(judged, step, truth, NAME, target)
         if due and step.t >= due[0]:
