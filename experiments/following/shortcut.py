@@ -172,14 +172,8 @@ def _figures(rows: Sequence[Row], method: Method) -> dict[str, float]:
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List where the exact range has an error or no solution."""
     unsolved = any(found[EXACT]["unsolved"] > 0 for found in summary.values())
-    return [
-        text
-        for text, bad in (
-            (f"exact range: {_worst(summary):g} degrees", not _worst(summary) <= ROUNDING_DEG),
-            ("exact range: no solution somewhere", unsolved),
-        )
-        if bad
-    ]
+    lost = [] if _worst(summary) <= ROUNDING_DEG else [f"exact range: {_worst(summary):g} degrees"]
+    return [*lost, "exact range: no solution somewhere"] if unsolved else lost
 
 
 def _worst(summary: Mapping[str, Any]) -> float:

@@ -48,11 +48,11 @@ def _one(folder: Path, number: int, at: tuple[float, float, float], seconds: flo
             before = emulated.truth()
             begins = before["world"] + rig.clock.now() - before["t"]
             wire = _aims(rig, config, calibration, seconds)
-        step = np.radians(emulated.sim.sim.head.step_deg)
-        world = SimWorld(paced(emulated.sim))
-        with guard(world.rig, emulated.sim.safety) as rig:
-            rig.clock.sleep_until(begins)
-            direct = _aims(rig, emulated.sim, calibration, seconds)
+    step = np.radians(emulated.sim.sim.head.step_deg)
+    world = SimWorld(paced(emulated.sim))  # after the end of the emulator, which needs a core
+    with guard(world.rig, emulated.sim.safety) as rig:
+        rig.clock.sleep_until(begins)
+        direct = _aims(rig, emulated.sim, calibration, seconds)
     row = {"figure": "parity", "place": number, "x": at[0], "y": at[1], "z": at[2], "load": load()}
     for axis, name in enumerate(("pan", "tilt")):
         row[f"{name}_steps"] = float(abs(wire[-1][axis] - direct[-1][axis]) / step)
