@@ -34,7 +34,7 @@ from experiments.engine import (
     read_rows,
 )
 from experiments.report import Bound, compare
-from experiments.tables import as_text, number, outside, rms, spread, spread_columns
+from experiments.tables import as_text
 from tests.support.tiny_experiments import KNOWN, TINY, here, here_together, notes, pids, timed
 
 DEADLINE_S = 120.0  # for a program to come as far as it is waited for
@@ -315,19 +315,6 @@ def test_figures_as_tables():
     lines = [line.split() for line in text.splitlines()]
     assert lines == [["yield", "size"], ["book", "1", "(0.5", "to", "1234)", "2"], ["bird", "0.25", "-"]]
     assert as_text({"a": 1, "b": [2, 3]}).split() == ["a", "1", "b", "2,", "3"]
-
-
-def test_statistics():
-    assert rms([3.0, math.nan, 4.0]) == pytest.approx(math.sqrt(12.5))
-    assert math.isnan(rms([]))
-    assert spread([3, None, 1.0, 2.0]) == {"median": 2.0, "least": 1.0, "largest": 3.0}
-    assert math.isnan(spread([])["median"])
-    rows = [{"seed": 1, "a": 1.0, "b": "x"}, {"seed": 2, "a": 3.0, "b": "y"}]
-    assert spread_columns(rows) == {"a": spread([1.0, 3.0])}
-    assert outside({"a": 0.5, "b": {"median": 2.0}}, {"a": (0.0, 0.4), "b": (1.0, 2.0)}, "book") == [
-        "book: a: 0.5, not 0 to 0.4"
-    ]
-    assert number(np.float32(0.5)) == "0.5"
 
 
 # ---------------------------------------------------------------- what a seed takes

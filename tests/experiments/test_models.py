@@ -173,13 +173,7 @@ def test_the_worked_examples_rig_errs_as_the_worked_example_does():
 
 
 def test_exponents_are_fitted_to_the_rows():
-    rows = [
-        {"noise_px": noise, "placements": n, "reached_px": 3.0 * noise * n**-0.5}
-        for noise in (0.02, 0.1, 0.5)
-        for n in (6, 12, 48)
-    ]
-    assert calibration_budget.exponents(rows) == pytest.approx((1.0, -0.5))
-    of_one_noise = [row for row in rows if row["noise_px"] == 0.1]
-    assert calibration_budget.exponents(of_one_noise) == pytest.approx((math.nan, -0.5), nan_ok=True)
-    of_one_number = [row for row in rows if row["placements"] == 6]
-    assert calibration_budget.exponents(of_one_number) == pytest.approx((1.0, math.nan), nan_ok=True)
+    rows = [{"noise_px": n, "placements": 4 * n, "reached_px": 3.0 * n} for n in (1.0, 2.0)]
+    fitted = calibration_budget.exponents([*rows, rows[0] | {"placements": 16, "reached_px": 1.5}])
+    assert fitted == pytest.approx((1.5, -0.5))  # 3 to 6 from 1 px and 4 placements to 2 px and 8, to 1.5 with 16
+    assert np.isnan(calibration_budget.exponents([rows[0] | {"placements": n} for n in (4, 8)])[0])  # of one noise
