@@ -1,13 +1,13 @@
 """Emulated devices without a simulated world: axes, lenses and images, and each device with such behind it."""
 
 import contextlib
-import math
 import os
 import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.ports import UnitPorts
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.emulators.serve import Faults
+from cotarget.emulators.world import EmulatedAxis
 from cotarget.errors import DeviceError
 from cotarget.sim.motion import Axis
 
@@ -29,42 +30,16 @@ USER, PASSWORD = "root", "hunter2 & co"
 DEADLINE_S = 20.0  # of real time: a loaded machine has reached it only if something hangs
 
 
-class AxisModel:
-    """An axis with the simulation's trapezoids, on a clock; an `AxisPlant`.
-
-    Attributes:
-        furthest: largest position that was commanded, without sign.
-    """
+class AxisModel(EmulatedAxis):
+    """An axis in steps, on a clock, without delay; it notes the largest position that was commanded, without sign."""
 
     def __init__(self, now=time.monotonic):
-        self.now, self.axis, self.rest, self.furthest = now, Axis(1e6, 1.0), -math.inf, 0.0
-        self.lock = threading.Lock()
+        super().__init__(Axis(1e6, 1.0), SimpleNamespace(now=now), 1.0, 0.0)
+        self.furthest = 0
 
     def command(self, goal, speed, acceleration):
-        with self.lock:
-            self.axis.acceleration = acceleration
-            self.rest = self.axis.command(self.now(), goal, speed)
-            self.furthest = max(self.furthest, abs(goal))
-
-    def halt(self, acceleration):
-        with self.lock:
-            self.axis.acceleration = acceleration
-            self.rest = self.axis.halt(self.now())
-
-    def at(self, t):
-        """Position and speed at a time."""
-        with self.lock:
-            return self.axis.motor(t)
-
-    def position(self):
-        return round(self.at(self.now())[0])
-
-    def speed(self):
-        return self.at(self.now())[1]
-
-    def moving(self):
-        with self.lock:
-            return self.now() < self.rest
+        self.furthest = max(self.furthest, abs(goal))
+        super().command(goal, speed, acceleration)
 
 
 class LiveUnit:
