@@ -12,6 +12,7 @@ medians over the steps.
    of the simulation alone is given too.
 """
 
+import contextlib
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -61,9 +62,7 @@ class SimSpeedSettings(FieldSettings):
 
 def one(settings: SimSpeedSettings, seed: int) -> list[Row]:
     """Time all cases once; give a row per step."""
-    rows = _beside_renderer(settings, seed)
-    for effects in (*((name,) for name in IMAGE_EFFECTS), IMAGE_EFFECTS):
-        rows += _beside_none(settings, seed, effects)
+    rows = _beside_renderer(settings, seed) + _beside_none(settings, seed)
     for what, steps in (
         ("rendered", held(calibrated(settings), settings.seconds_rendered, seed)),
         ("unrendered", held_unrendered(calibrated(settings), settings.seconds, seed)),
@@ -122,17 +121,20 @@ def _beside_renderer(settings: SimSpeedSettings, seed: int) -> list[Row]:
     return rows
 
 
-def _beside_none(settings: SimSpeedSettings, seed: int, effects: Sequence[str]) -> list[Row]:
-    """Time steps with these image effects and with none, in turns."""
-    with_them, without = Stepper(config_with(seed, effects)), Stepper(config_with(seed, ()))
-    what = effects[0] if len(effects) == 1 else ALL
-    rows = []
-    with with_them.world.rig, without.world.rig:
+def _beside_none(settings: SimSpeedSettings, seed: int) -> list[Row]:
+    """Time steps with each image effect alone, with all of them and with none, in turns."""
+    ways = {**{name: (name,) for name in IMAGE_EFFECTS}, ALL: IMAGE_EFFECTS}
+    without, steppers = Stepper(config_with(seed, ())), {what: Stepper(config_with(seed, ways[what])) for what in ways}
+    rows: dict[str, list[Row]] = {what: [] for what in ways}
+    with contextlib.ExitStack() as stack:
+        for each in (without, *steppers.values()):
+            stack.enter_context(each.world.rig)
         for i in range(settings.steps + 1):
-            took, bare = with_them.step(), without.step()
-            if i:
-                rows.append({"seed": seed, "what": what, "step": i, "ms": 1e3 * took, "without_ms": 1e3 * bare})
-    return rows
+            bare = without.step()
+            for what, stepper in steppers.items():
+                row = {"seed": seed, "what": what, "step": i, "ms": 1e3 * stepper.step(), "without_ms": 1e3 * bare}
+                rows[what] += [row] if i else []
+    return [row for mine in rows.values() for row in mine]
 
 
 def held(calibration: Calibration, seconds: float, seed: int) -> Iterator[tuple[Step, Truth]]:

@@ -102,7 +102,7 @@ def spread_views(
 ) -> list[View]:
     """Make views of boards over the whole fixed view, each from head poses that spread it over the zoom view.
 
-    Arguments are those of `synthetic_views`.
+    Arguments as for `synthetic_views`.
 
     Raises:
         AssertionError: there is no room for a board.
