@@ -36,6 +36,8 @@ STREAM_PATH = "/axis-cgi/mjpg/video.cgi"
 AXIS = "AXIS"  # the brand that an Axis reports
 # On a local network a running device accepts a connection within milliseconds [s].
 CONNECT_S = 2.0
+# Longest text that is read [bytes]: some servers answer every path with their endless stream.
+LONGEST_TEXT = 65536
 # Longest quotation of a device's text in a message [characters].
 LONGEST_QUOTE = 60
 # A stream has stalled after this time without a byte [s], or after this many frame periods where that is longer.
@@ -281,8 +283,13 @@ class VideoServer:
             return self.read(response) if response.status_code == 200 else ""
 
     def read(self, response: "httpx.Response") -> str:
-        """Read the text of a response."""
-        return b"".join(self.pieces(response)).decode("latin-1")
+        """Read the text of a response, up to `LONGEST_TEXT`."""
+        text = bytearray()
+        for piece in self.pieces(response):
+            text += piece
+            if len(text) >= LONGEST_TEXT:
+                break
+        return text.decode("latin-1")
 
     def pieces(self, response: "httpx.Response") -> Iterator[bytes]:
         """Yield the bytes of a response as they arrive."""

@@ -218,7 +218,12 @@ def test_the_stream_is_asked_for_as_configured(server):
     assert server.requests[-1].query == {"camera": "1", "compression": "30", "fps": "25"}
 
 
-@pytest.mark.parametrize(("path", "page"), [(PARAM, NOT_FOUND), (STATUS, NOT_FOUND)])
+ENDLESS = STREAM + bytes(200_000)
+
+
+@pytest.mark.parametrize(
+    ("path", "page"), [(PARAM, NOT_FOUND), (STATUS, NOT_FOUND), pytest.param(PARAM, ENDLESS, id="endless")]
+)
 def test_a_server_that_tells_nothing_of_itself_is_taken_as_it_is(server, path, page):
     server.pages[path] = page
     with opened(server) as camera:
