@@ -93,7 +93,6 @@ def _calibrate(seed: int, work: Path, progress: Progress) -> dict[str, Any]:
     """Calibrate from rendered boards and draw the rig; return the calibration's residuals and its true errors."""
     import numpy as np
 
-    from cotarget.calibration import save_calibration
     from cotarget.calibration.calibrate import calibrate
     from cotarget.control.controller import reach_of
     from cotarget.drawing import captioned, draw_frames, write_picture
@@ -110,7 +109,7 @@ def _calibrate(seed: int, work: Path, progress: Progress) -> dict[str, Any]:
             seed=seed,
             progress=lambda done, total, text: progress(done, total, f"calibrating: {text}"),
         )
-        save_calibration(work / CALIBRATION, calibration)
+        calibration.save(work / CALIBRATION)
         rng = np.random.default_rng((seed, POINTING_STREAM))
         errors = np.degrees(pointing_errors(calibration, world.truth(), reach_of(rig), rng, POINTING_TARGETS))
         rig.head.move(0.0, 0.0, wait=True)  # here the zoom camera's frame is zoom0
@@ -135,7 +134,7 @@ def _calibrate(seed: int, work: Path, progress: Progress) -> dict[str, Any]:
 
 def _follow_one(name: str, seed: int, work: Path, progress: Progress) -> None:
     """Follow one target; write its rows, its picture and its part of the video."""
-    from cotarget.calibration import load_calibration
+    from cotarget.calibration import Calibration
     from cotarget.drawing import TargetStages, side_by_side, write_picture
     from cotarget.evaluation import add_row
     from cotarget.metrics import Row, write_rows
@@ -146,7 +145,7 @@ def _follow_one(name: str, seed: int, work: Path, progress: Progress) -> None:
 
     config = sim_config(SCENES[name], (name,), seed)
     target, rate_hz = config.target(name), config.sim.fixed.rate_hz
-    calibration = load_calibration(work / CALIBRATION)
+    calibration = Calibration.load(work / CALIBRATION)
     world = SimWorld(config)
     truth = world.truth()
     rows: list[Row] = []

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.camera import Intrinsics, ZoomLens, depth_from_size, focal_for_size
+from cotarget.camera import Intrinsics, ZoomLens, depth_from_size
 from cotarget.errors import ConfigError
 
 # Table 2 as (u, v); the paper lists rows as [v, u].
@@ -79,15 +79,6 @@ def test_the_papers_worked_example():
     assert round(x[1], 1) == 526.3
     with_half = Intrinsics((640, 480), (686.0, 684.0), (325.0, 239.5)).ray(np.array([529.0, 275.0])) * 10000
     assert round(with_half[1]) == 519
-
-
-def test_the_papers_focal_length():
-    """The book is 234 mm; 160 px wanted at 10464 mm: 7155 px, which is 10.3 of 12 times zoom and 64.4 mm."""
-    focal = focal_for_size(234.0, 160.0, 10464.0)
-    assert round(focal) == 7155
-    assert round(focal * 0.009, 1) == 64.4
-    assert round(focal * 0.009 / 6.237, 1) == 10.3
-    assert round(focal_for_size(234.0, 160.0, 10510.0)) == 7186  # with the exact range after centring
 
 
 def test_depth_from_size_is_the_inverse_of_projection():

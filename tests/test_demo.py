@@ -1,6 +1,5 @@
 """The demo: results that appear together or not at all, and (slow) the figures that it reaches."""
 
-import dataclasses
 import json
 import os
 import re
@@ -12,8 +11,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from cotarget.config import RigConfig, SimConfig
-from cotarget.demo import SUMMARY, finished_together, run_demo, sim_config, summary
+from cotarget.demo import SUMMARY, finished_together, run_demo, summary
 from cotarget.errors import ConfigError
 
 FIGURES = dict.fromkeys(SUMMARY)
@@ -79,13 +77,6 @@ def test_the_summary_has_a_line_a_target_and_a_dash_for_a_missing_figure():
         ["book", "0.44", "s", "1.00", "0.88", "1.0%", "1.02", "10.0", "m"],
         ["bird", "-", "s", "-", "0.00", "-", "-", "22.0", "m"],
     ]
-
-
-def test_the_demo_uses_the_default_rig():
-    """With every effect that is on by default."""
-    config = sim_config("indoor", ("book",), 7)
-    assert config.sim == dataclasses.replace(SimConfig(), scene="indoor", targets=("book",), seed=7)
-    assert config == dataclasses.replace(RigConfig(), sim=config.sim)
 
 
 def test_the_process_that_starts_the_runs_imports_nothing_large():

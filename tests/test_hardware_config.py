@@ -5,9 +5,8 @@ import tomllib
 import pytest
 
 from cotarget.backends import check, describe
-from cotarget.config import HardwareConfig, parse_config
+from cotarget.config import parse_config
 from cotarget.drivers.board import socket_address
-from cotarget.drivers.rig import devices
 from cotarget.errors import ConfigError
 
 # Values that a key of [hardware] refuses.
@@ -62,12 +61,6 @@ def test_latency_above_the_frame_age_limit_is_refused(backend, camera):
 ])  # fmt: skip
 def test_socket_addresses(url, address):
     assert socket_address(url) == address
-
-
-def test_default_head_signs_are_those_of_a_ptu_d46():
-    """Positive pan of a PTU-D46 turns left, where a rig's turns right; positive tilt goes up for both."""
-    head = devices(HardwareConfig())["head"].settings
-    assert (head.pan_sign, head.tilt_sign) == (-1, 1)
 
 
 def test_the_drivers_describe_their_devices():

@@ -315,8 +315,3 @@ def test_a_file_that_is_no_table_is_refused(tmp_path, content):
     with pytest.raises(ConfigError, match=r"steps\.csv: is no steps\.csv") as caught:
         read_rows(path)
     assert "\n" not in str(caught.value)
-
-
-def test_a_missing_table_is_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"none\.csv"):
-        read_rows(tmp_path / "none.csv")

@@ -187,21 +187,6 @@ def test_the_focal_length_is_limited_to_the_lens(how, nominal, limited):
     assert (found.nominal_px, found.limited) == (pytest.approx(nominal, rel=RELATIVE), limited)
 
 
-def test_positive_pan_is_right_and_positive_tilt_is_up():
-    """Without offsets: atan(1 / 10) to the right, and up, where y is negative."""
-    right, up = (aim(HOME, np.array(x), ANYWHERE) for x in ([1.0, 0.0, 10.0], [0.0, -1.0, 10.0]))
-    assert (right.pan, right.tilt) == pytest.approx((math.atan(0.1), 0.0), abs=1e-12)
-    assert (up.pan, up.tilt) == pytest.approx((0.0, math.atan(0.1)), abs=1e-12)
-
-
-def test_the_nearest_way_round_is_taken():
-    """A target behind can be looked at by pan 180 or -180: the one that is nearer to where the head is."""
-    wide = replace(ANYWHERE, pan=(-3.5, 3.5))
-    for now in (3.0, -3.0):
-        found = aim(HOME, np.array([0.0, 0.0, -10.0]), replace(wide, now=(now, 0.0)))
-        assert found.pan == pytest.approx(math.copysign(math.pi, now))
-
-
 @pytest.mark.parametrize(("name", "size_px", "depth"), [
     ("book", 686 * 0.234 / 10, 10.0),  # a width: along u
     ("person", 684 * 1.75 / 12, 12.0),  # a height: along v
@@ -278,12 +263,6 @@ def test_error_budget_off_to_the_side():
     high = replace(aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE), tilt=math.radians(60))
     steps = error_budget(HOME, pixel, high, replace(ANYWHERE, step=0.001))["steps"]
     assert steps == pytest.approx(0.001 * SIGMA * math.sqrt(1 + 0.25), rel=RELATIVE)
-
-
-def test_a_pixel_and_its_depth_aim_at_the_point_that_they_mean():
-    by_pixel = aim(HOME, pixel=(400, 100), depth=9.0)
-    by_point = aim(HOME, point_at(HOME, np.array([400.0, 100.0]), 9.0))
-    assert (by_pixel.pan, by_pixel.tilt, by_pixel.nominal_px) == (by_point.pan, by_point.tilt, by_point.nominal_px)
 
 
 def test_a_pixel_is_not_aimed_at_by_a_calibration_in_millimetres_unless_insisted_on():

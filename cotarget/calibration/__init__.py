@@ -14,7 +14,7 @@ Arguments that mean the same in all functions here:
 from cotarget.board import draw_board
 from cotarget.calibration.calibrate import calibrate_captures, calibrate_photos, calibrate_views
 from cotarget.calibration.corners import find_corners
-from cotarget.calibration.file import Calibration, load_calibration, save_calibration
+from cotarget.calibration.file import Calibration
 from cotarget.calibration.handeye import HandEye, solve_hand_eye, solve_hand_eye_from_motions
 from cotarget.calibration.model import Capture, Covariance, HeldOut, Options, Rejected, Residuals, View
 from cotarget.calibration.observability import Observability, name_directions, weak_directions
@@ -37,10 +37,8 @@ __all__ = [
     "draw_board",
     "find_corners",
     "line_of_sight_covariance",
-    "load_calibration",
     "name_directions",
     "predicted_pointing",
-    "save_calibration",
     "solve_hand_eye",
     "solve_hand_eye_from_motions",
     "weak_directions",

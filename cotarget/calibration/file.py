@@ -124,16 +124,6 @@ class Calibration:
         write_atomically(Path(path), text.encode())
 
 
-def load_calibration(path: Path) -> Calibration:
-    """Read a calibration.json; see `Calibration.load`."""
-    return Calibration.load(path)
-
-
-def save_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration.json; see `Calibration.save`."""
-    calibration.save(path)
-
-
 def read_object(path: Path, wanted: str) -> Table:
     """Read a JSON object from a file."""
 

@@ -73,7 +73,7 @@ def calibrate_command(options: argparse.Namespace) -> None:
         else:
             found = cal.calibrate_captures(options.source, options=how, progress=progress)
         with previous_kept(options.out):
-            cal.save_calibration(options.out, found)
+            found.save(options.out)
     _print_result(found, options.out)
 
 

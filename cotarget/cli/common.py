@@ -36,10 +36,10 @@ def naming(where: object) -> Iterator[None]:
 
 def load_plausible(path: Path, spec: "RigSpec | None" = None, *, insist: bool) -> "Calibration":
     """Load a calibration; refuse one that is implausible, by itself or for a rig, unless the user insists."""
-    from cotarget.calibration import load_calibration
+    from cotarget.calibration import Calibration
     from cotarget.calibration.plausibility import implausibility
 
-    calibration = load_calibration(path)
+    calibration = Calibration.load(path)
     if spec is not None:
         with naming(path):
             calibration.for_streams(spec.fixed.size, spec.zoom.size)

@@ -86,7 +86,7 @@ def follow_command(options: argparse.Namespace) -> int:
 def replay_command(options: argparse.Namespace) -> int:
     """Run `cotarget replay`: run the pipeline on a recording and compare its commands; return the exit status."""
     from cotarget.backends import open_recording
-    from cotarget.calibration import load_calibration
+    from cotarget.calibration import Calibration
     from cotarget.recording.replay import Replay
     from cotarget.safety.safe_rig import guard
     from cotarget.track_metrics import read_labels
@@ -94,7 +94,7 @@ def replay_command(options: argparse.Namespace) -> int:
     recording = open_recording(options.recording)
     for note in recording.notes:
         print(f"{options.recording}: {note}", file=sys.stderr)
-    calibration = load_calibration(recording.calibration)
+    calibration = Calibration.load(recording.calibration)
     config, name, rate_hz = recording.config, recording.target, recording.spec.fixed.rate_hz
     check_outputs(_files(options), [*rig_files(None, config), options.recording, options.labels])
     labels = None if options.labels is None else read_labels(options.labels)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.backends import check, describe, load_config
-from cotarget.calibration import Calibration, load_calibration
+from cotarget.calibration import Calibration
 from cotarget.config import (
     DEFAULT_TARGETS,
     RigConfig,
@@ -319,7 +319,7 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         if render_mode is not None:
             one_of("render_mode", render_mode, self.metadata["render_modes"])
         if isinstance(calibration, Path | str):
-            calibration = load_calibration(Path(calibration))
+            calibration = Calibration.load(Path(calibration))
         own = isinstance(calibration, Calibration | None)
         require(own, "calibration", calibration, "a cotarget.calibration.Calibration or the path of one")
         lasts = f"above 0 and up to {SECONDS:g}, as long as the targets' paths"

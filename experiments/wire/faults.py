@@ -21,7 +21,6 @@ from typing import IO, Any
 import numpy as np
 
 from cotarget.backends import describe
-from cotarget.calibration import save_calibration
 from cotarget.config import parse_config
 from cotarget.emulators.emulation import FAULTS
 from cotarget.emulators.process import EmulatedRig, end
@@ -107,7 +106,7 @@ class Follower:
 
     def __init__(self, folder: Path, emulated: EmulatedRig) -> None:
         calibration = folder / "calibration.json"
-        save_calibration(calibration, exact_calibration(emulated.sim))
+        exact_calibration(emulated.sim).save(calibration)
         options = ["--rig", str(emulated.rig_toml()), "--calibration", str(calibration), "--seconds", "600"]
         command = [sys.executable, "-m", "cotarget.cli", "follow", "--target", "book", *options]
         self._errors: IO[str] = (folder / "follow.log").open("w+", encoding="utf-8")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from cotarget.board import draw_board
-from cotarget.calibration import calibrate_captures, calibrate_photos
+from cotarget.calibration import Options, calibrate_captures, calibrate_photos
+from cotarget.calibration.calibrate import find_views
 from cotarget.calibration.captures import INDEX, pair_photos, read_images, read_index
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
@@ -94,6 +95,15 @@ def test_photos_without_pairs_are_refused(tmp_path, names, left, said):
     assert said in str(caught.value)
     with pytest.raises(CalibrationError, match="no such folder"):
         calibrate_photos(tmp_path / "none", left, "right*.png", BoardConfig())
+
+
+def test_sequential_method_rejects_images_beyond_the_shortest_focal_length(tmp_path):
+    for name in ("a.png", "b.png", "c.png"):
+        cv2.imwrite(str(tmp_path / name), draw_board(BoardConfig(), 30))
+    write(tmp_path, [FIXED, ZOOM, ZOOM | {"file": "c.png", "focal_px": 1334.0}])
+    views, rejected, _ = find_views(tmp_path, read_index(tmp_path), None, Options("sequential"))
+    assert [view.source for view in views] == ["a.png", "b.png"]
+    assert [one.name for one in rejected] == ["c.png"]
 
 
 def test_images_of_two_boards_are_not_used(tmp_path):

@@ -9,14 +9,12 @@ from cotarget.board import (
     MARKER_SHARE,
     board_points,
     cells,
-    check_board,
     draw_board,
     marker_dictionary,
     tiles,
 )
 from cotarget.calibration.corners import find_corners, find_near
 from cotarget.config import BoardConfig, parse_config
-from cotarget.errors import ConfigError
 from cotarget.geometry import pose
 from cotarget.sim.world import SimWorld
 
@@ -89,13 +87,6 @@ def test_charuco_is_found_in_part():
 ], ids=["nothing", "a plain chessboard", "one row", "noise"])  # fmt: skip
 def test_charuco_needs_more_than_one_row(image):
     assert find_corners(image, BOARD) is None
-
-
-def test_charuco_may_have_even_counts_but_not_too_many_markers():
-    check_board(BOARD)
-    check_board(BoardConfig("charuco", (21, 21)))
-    with pytest.raises(ConfigError, match=r"board\.corners"):
-        check_board(BoardConfig("charuco", (40, 30)))
 
 
 @pytest.mark.render

@@ -39,11 +39,6 @@ def test_exact_model_predicts_held_out_placements():
     assert widened <= MOST_WIDENED
 
 
-PLACEMENTS = 24
-# Each placement's views miss alike, by its own two coordinates: a mean over so many scatters by a fifth. Thrice that.
-NOISE_TOLERANCE = 0.6
-
-
 # The pose of a board comes from OpenCV here, of plain least squares in place of Huber's, which gives the corners beyond
 # three standard deviations, one in a hundred, less weight: single misses differ by a hundredth or two.
 SAME_MISS = 0.03

@@ -55,24 +55,6 @@ def test_boards_facing_the_camera_leave_its_focal_length_open():
     assert not len(weak_directions(lens_normal(flat + tilted), LENS_NAMES, SIGMA_PX**2))
 
 
-def test_limits_of_use_scale_with_the_focal_length():
-    """At 7000 px k1 hardly bends the image."""
-    boards = [
-        pose([x, y, z], [a, b, 0])
-        for x, y, z, a, b in (
-            (0.3, 0.1, 20, 30, 0),
-            (-0.3, 0.2, 25, 0, 30),
-            (0.2, -0.1, 15, -30, 20),
-            (0, 0, 18, 20, -30),
-        )
-    ]
-    normal = lens_normal(boards, 7000.0)
-    assert "distortion" in name_directions(LENS_NAMES, weak_directions(normal, LENS_NAMES, SIGMA_PX**2))
-    focal_px = {"fixed": 7000.0}
-    weak = weak_directions(normal, LENS_NAMES, SIGMA_PX**2, focal_px)
-    assert "distortion" not in name_directions(LENS_NAMES, weak, focal_px)
-
-
 HAND_NAMES = [f"T_head_zoom.{name}" for name in POSE] + ["head.axis_offset", "head.squareness"]
 
 
@@ -109,24 +91,6 @@ def test_head_that_moves_too_little_is_named(angles, begins, free):
     assert text.startswith(begins)
     assert all(words in text for words in free)
     assert bool(text) == bool(begins)
-
-
-def test_weak_directions_are_the_null_space():
-    rng = np.random.default_rng(0)
-    normal = hand_normal([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.0)])
-    weak = weak_directions(normal, HAND_NAMES, SIGMA_PX**2)
-    assert weak.shape == (4, 8)  # rotation, shift, axis offset, squareness
-    step = rng.normal(size=(3, 4)) @ weak
-    assert (np.einsum("ki,ij,kj->k", step, normal, step) < SIGMA_PX**2 * np.sum((step / weak.max()) ** 2)).all()
-    mixed = np.array([[1.0, 1, 0, 0], [0, 1, 1, 0], [0, 0, 1, 1], [1, 0, 0, 5]]) @ weak
-    assert name_directions(HAND_NAMES, mixed) == name_directions(HAND_NAMES, weak)
-
-
-@pytest.mark.parametrize(("sigma", "weak"), [(4.9, 0), (5.1, 1)])
-def test_limit_of_use_of_a_rotation_is_five_degrees(sigma, weak):
-    names = ["T_zoom0_fixed.ry"]
-    normal = np.array([[1.0]]) / np.radians(sigma) ** 2
-    assert len(weak_directions(normal, names, 1.0)) == weak
 
 
 @pytest.mark.parametrize(("name", "free", "add"), [

@@ -100,12 +100,6 @@ def test_planned_head_poses_are_within_the_limits(session):
     assert ((narrow >= low) & (narrow <= high)).all()
 
 
-def test_progress_counts_up_to_its_total(session):
-    progress = session[3]
-    assert progress[-1][0] == progress[-1][1] == 18
-    assert all(b[0] >= a[0] for a, b in itertools.pairwise(progress))
-
-
 def test_index_lists_every_image_at_once(tmp_path):
     """Also those of the placement that is under way: in the zoom stage one of them holds many."""
     recorder = CaptureRecorder(SyntheticRig(), BOARD, tmp_path)

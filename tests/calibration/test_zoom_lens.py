@@ -1,14 +1,12 @@
-"""A session on a rig whose lens zooms, against its true optics over the range; and its captures, read again."""
+"""A session on a rig whose lens zooms, against its true optics over the range."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from cotarget.calibration import Options, calibrate_captures, predicted_pointing
+from cotarget.calibration import Options, predicted_pointing
 from cotarget.calibration.calibrate import calibrate
-from cotarget.calibration.captures import INDEX
 from cotarget.calibration.joint import with_stop
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
@@ -34,10 +32,6 @@ BORESIGHT_TOLERANCE = np.radians(0.04)
 # placements hardly reach.
 POINTING_FACTOR = 3.0
 PREDICTED_TOLERANCE = np.radians(0.01)
-# Corners are rounded to 1e-4 px, but those of parts of boards are sought from where they are predicted, which differs
-# in the last digits as the order does: a hundredth of what noise leaves uncertain.
-SAME_PX, SAME_POSE = 0.005, 1e-6  # focal lengths and centres [px]; rotations [rad] and positions [m]
-SAME_PUPIL = 1e-5  # [m]
 
 
 @pytest.fixture(scope="module")
@@ -91,30 +85,6 @@ def test_calibration_points_over_the_whole_focal_range(session, nominal):
 
 def rms(errors):
     return float(np.sqrt(np.mean(np.square(errors))))
-
-
-@pytest.mark.slow
-def test_captures_in_any_order_give_the_same_calibration(session):
-    calibration, directory, _ = session
-    table = json.loads((directory / INDEX).read_text())
-    np.random.default_rng(0).shuffle(table["captures"])
-    (directory / INDEX).write_text(json.dumps(table))
-    again = calibrate_captures(directory, options=QUICK)
-    assert {(view.source, int(view.seen.sum())) for view in again.views} == {
-        (view.source, int(view.seen.sum())) for view in calibration.views
-    }
-    pairs = [
-        (calibration.fixed.lens, again.fixed.lens),
-        *zip(calibration.zoom_head.lens.stops, again.zoom_head.lens.stops, strict=True),
-    ]
-    for one, other in pairs:
-        assert one.focal_px == pytest.approx(other.focal_px, abs=SAME_PX)
-        assert one.center_px == pytest.approx(other.center_px, abs=SAME_PX)
-    assert again.zoom_head.lens.nominal_px == calibration.zoom_head.lens.nominal_px
-    assert again.zoom_head.lens.pupil == pytest.approx(calibration.zoom_head.lens.pupil, abs=SAME_PUPIL)
-    for name in ("T_zoom0_fixed", "T_head_zoom"):
-        one, other = getattr(calibration.zoom_head, name).as_matrix(), getattr(again.zoom_head, name).as_matrix()
-        assert np.allclose(one, other, rtol=0, atol=SAME_POSE)
 
 
 # With centres 0, d, d, 0 one step apart, half a step in: the cubic through them is the parabola d (3 x - x^2) / 2, at

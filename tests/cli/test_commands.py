@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import cotarget
-from cotarget.calibration import Options, draw_board, save_calibration
+from cotarget.calibration import Options
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import pose
-from experiments.calibration.synthetic.rig import NOMINAL_PX, Truth, undistorted
-from tests.support.commands import OLD, bird_film, call, capture, refused, true_calibration, write_index
-from tests.support.synthetic_rig import draw, fourfold, pixel_rays, zoomed
+from experiments.calibration.synthetic.rig import Truth, undistorted
+from tests.support.commands import OLD, bird_film, call, refused, true_calibration, write_index
+from tests.support.synthetic_rig import draw, pixel_rays
 
 PIXEL = 1e-5  # an angle of 1e-11 rad, printed in full, at 692 px; and a text's rounding
 CLOSE = 1e-9
@@ -34,7 +34,7 @@ def folder(tmp_path, monkeypatch):
     """A working folder with a rig, its calibration, and old results."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
-    save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
+    true_calibration(RigConfig()).save(tmp_path / "good.json")
     for name in ("out.csv", "out.mp4"):
         (tmp_path / name).write_text(OLD)
     (tmp_path / "photos").mkdir()
@@ -131,9 +131,7 @@ def test_aim_warns_of_a_size_that_the_lens_cannot_show(folder, capsys):
         return found, [line for line in warnings if f"the lens shows the {target}" in line]
 
     near, [line] = aimed("1", "person")
-    shown = 1.75 * near["focal_px"] * 693 / 692 / near["range_m"]
-    assert shown > 1000
-    assert f" {shown:.0f} px " in line
+    assert f" {1.75 * near['focal_px'] * 693 / 692 / near['range_m']:.0f} px " in line
     far, [line] = aimed("3000", "book")
     assert f" {0.234 * far['focal_px'] / far['range_m']:.2g} px " in line
     limit = 72.0 * 692 / 6.0 * 0.234 / 160  # range from which on the lens is too short [m]
@@ -141,7 +139,6 @@ def test_aim_warns_of_a_size_that_the_lens_cannot_show(folder, capsys):
     for beyond, limited, warned in ((0.998, False, False), (1.002, True, False), (1.008, True, True)):
         book, lines = aimed(f"{depth * beyond}", "book")
         assert (book["focal_limited"], bool(lines)) == (limited, warned)
-    assert aimed("30", "book")[0]["focal_mm"] == pytest.approx(72.0)
 
 
 @pytest.mark.parametrize("focal_mm", ["6", "50", "72"])
@@ -185,27 +182,6 @@ def test_calibrate_takes_photos_of_a_chessboard(folder, capsys):
     assert alone in saved["residuals"]["rejected"]
 
 
-def test_calibrate_takes_photos_of_a_charuco_board(folder, capsys):
-    """8x6 corners, which a plain chessboard must not have, seen by two cameras without distortion."""
-    truth, rng, square_px = Truth(), np.random.default_rng(0), 40
-    picture = draw_board(BoardConfig("charuco", (8, 6), 0.1), square_px)
-    first = 2 * square_px - 0.5  # where the first inner corner is drawn
-    to_board = np.diag([0.1 / square_px, 0.1 / square_px, 1.0]) @ [[1, 0, -first], [0, 1, -first], [0, 0, 1]]
-    for number in range(8):
-        T = pose([*rng.uniform([-0.8, -0.5], [0.0, 0.0]), rng.uniform(1.6, 2.0)], rng.uniform(-25, 25, 3)).as_matrix()
-        for side, lens, M in (("left", truth.fixed, T), ("right", truth.zoom, truth.gamma.as_matrix() @ T)):
-            photo = cv2.warpPerspective(
-                picture, lens.K @ M[:3, [0, 1, 3]] @ to_board, (640, 480), borderValue=(160,) * 3
-            )
-            cv2.imwrite(str(folder / "photos" / f"{side}{number}.png"), photo)
-    status, out, err = call(capsys, *FROM, "photos", *PHOTOS, "8x6", "--kind", "charuco")
-    assert (status, err) == (0, "")
-    printed = json.loads(out)
-    assert printed["fixed_views"] == printed["zoom_views"] == 8
-    assert printed["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
-    assert json.loads((folder / "new.json").read_text())["board"]["kind"] == "charuco"
-
-
 @pytest.mark.parametrize(("more", "options"), [
     ((), Options()), (("--encoders",), Options(encoders=True)), (("--insist",), Options(regularize=True)),
     (("--method", "sequential"), Options("sequential")),
@@ -221,66 +197,6 @@ def test_calibrate_passes_the_options_of_the_fit(folder, capsys, monkeypatch, mo
     write_index(folder / "photos", [])
     assert refused(capsys, *FROM, "photos", *more) == "cotarget calibrate: enough"
     assert asked == [options]
-
-
-@pytest.fixture(scope="module")
-def zooming(tmp_path_factory):
-    """A folder of captures of a head that pans and tilts, most at the shortest focal length and some at twice that."""
-    directory = tmp_path_factory.mktemp("zooming")
-    truth, board, rng, rows = Truth(), BoardConfig(), np.random.default_rng(1), []
-    far = zoomed(truth, fourfold(2 * NOMINAL_PX))
-    rays = {lens: pixel_rays(lens) for lens in (truth.fixed, truth.zoom, far.zoom)}
-
-    def take(camera, number, T_camera_board, lens, turn=(0.0, 0.0), focal_px=None):
-        name = f"{len(rows):02d}.png"
-        cv2.imwrite(str(directory / name), np.round(draw(lens, T_camera_board, board, rays[lens])).astype(np.uint8))
-        pan, tilt = turn
-        rows.append(capture(name, camera, board=number, pan=pan, tilt=tilt, focal_px=focal_px, t=float(len(rows))))
-
-    for number in range(8):
-        turned = pose([0.0, 0.0, 0.0], rng.uniform(-25, 25, 3))
-        middle = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(2.8, 4.0)])
-        T = turned.as_matrix()
-        T[:3, 3] = middle - turned.apply([0.4, 0.25, 0.0])
-        take("fixed", number, T, truth.fixed)
-        ahead = truth.gamma.apply(middle)
-        pan, tilt = math.atan2(ahead[0], ahead[2]), math.atan2(-ahead[1], ahead[2])
-        for turn in ((0.0, 0.0), (pan, 0.0), (pan + 0.1, 0.0), (pan, tilt), (pan, tilt - 0.1)):
-            take("zoom", number, truth.zoom_fixed(*turn) @ T, truth.zoom, turn, NOMINAL_PX)
-        if number < 4:
-            take("zoom", number, far.zoom_fixed(pan, 0.0) @ T, far.zoom, (pan, 0.0), 2 * NOMINAL_PX)
-    write_index(directory, rows)
-    return directory, rows
-
-
-@pytest.mark.slow
-def test_calibrate_with_insist_accepts_pan_alone_at_every_focal_length(folder, capsys, zooming):
-    """With pan alone, the first fit, at the shortest focal length, is refused."""
-    directory, rows = zooming
-    write_index(directory, [row for row in rows if row["tilt"] == 0])
-    assert "only pan moved" in refused(capsys, *FROM, directory)
-    status, _, err = call(capsys, *FROM, directory, "--insist")
-    assert (status, err) == (0, "")
-    assert len(json.loads((folder / "new.json").read_text())["zoom"]["stops"]) == 2
-
-
-@pytest.mark.slow
-def test_sequential_method_rejects_images_at_other_focal_lengths(folder, capsys, zooming, monkeypatch):
-    def never(*_):
-        raise AssertionError("the joint method was asked")
-
-    monkeypatch.setattr("cotarget.calibration.calibrate.joint", never)
-    directory, rows = zooming
-    write_index(directory, rows)
-    status, out, err = call(capsys, *FROM, directory, "--method", "sequential")
-    assert status == 0, err
-    assert json.loads(out)["rejected"] == 4
-    assert f"not used: 4 of {len(rows)} images" in err
-    far = [row["file"] for row in rows if row["focal_px"] == 2 * NOMINAL_PX]
-    printed = json.loads((folder / "new.json").read_text())["residuals"]["rejected"]
-    assert printed == [
-        {"name": name, "reason": "taken at 1334 px, not at the shortest focal length, 667 px"} for name in far
-    ]
 
 
 @pytest.mark.render
@@ -310,18 +226,14 @@ def test_detect_writes_a_table(folder, capsys):
     assert not (folder / "-").exists()
 
 
+def test_version(capsys):
+    assert call(capsys, "--version")[:2] == (0, f"cotarget {cotarget.__version__}\n")
+
+
 def test_ctrl_c_ends_without_a_traceback(folder, capsys, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cotarget.calibration.load_calibration", interrupted)
+    monkeypatch.setattr("cotarget.calibration.Calibration.load", interrupted)
     status, out, err = call(capsys, *AIM, "--depth", "5")
     assert (status, out, err) == (130, "", "cotarget aim: interrupted\n")
-
-
-def test_help_and_version(capsys):
-    for command in ("demo", "calibrate", "aim", "follow", "detect", "doctor"):
-        status, out, err = call(capsys, command, "--help")
-        assert (status, err) == (0, "")
-        assert out.startswith(f"usage: cotarget {command}")
-    assert call(capsys, "--version")[:2] == (0, f"cotarget {cotarget.__version__}\n")

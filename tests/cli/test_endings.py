@@ -14,10 +14,10 @@ from cotarget.backends import OPENERS
 from cotarget.cli.following import FEW, MANY, LensAtItsEnd, Reasons, StepCounts
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.errors import DeviceError
-from cotarget.pipeline import State, follow
+from cotarget.pipeline import State
 from cotarget.video import Film, FilmWriter
 from tests.support.commands import OLD, call, refused
-from tests.support.recorded_run import Bright, ToyDevices, calibration_file, record, toy_rig
+from tests.support.recorded_run import Bright, ToyDevices, calibration_file, toy_rig
 from tests.support.rigs import rig_of
 from tests.support.steps import step
 
@@ -85,14 +85,6 @@ def test_follow_halts_the_head_then_keeps_the_steps_so_far(folder, capsys, monke
     assert not [path for path in folder.iterdir() if ".part" in path.name]
 
 
-def test_recording_ended_by_ctrl_c_is_replayed(folder, capsys, monkeypatch):
-    monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig({("fixed.read", 2 * FRAMES): KeyboardInterrupt()}))
-    assert call(capsys, *FOLLOW, "--record", "run")[0] == 0
-    status, out, err = call(capsys, "replay", "run", "--check")
-    assert (status, err) == (0, "")
-    assert json.loads(out)["steps"] == 2 * FRAMES - 1
-
-
 @pytest.mark.parametrize("failing", ["head.move", "fixed.read"])
 def test_recording_of_a_failed_device_is_replayed_to_its_end(folder, capsys, caplog, monkeypatch, failing):
     """The halts of the recorded run failed too."""
@@ -117,40 +109,11 @@ def test_failed_halt_is_reported_after_ctrl_c(folder, capsys, monkeypatch):
     assert "the head is gone" in err
 
 
-def test_follow_keeps_the_steps_before_an_emergency_stop(folder, capsys, monkeypatch):
-    class Stopped(ToyDevices):
-        def count(self, what):
-            super().count(what)
-            if self.calls["fixed.read"] == FRAMES:
-                (folder / "stop").write_text("the cat\n")
-
-    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(Stopped()))
-    status, out, err = call(capsys, *FOLLOW)
-    assert (status, out) == (1, "")
-    assert "emergency stop: the cat" in err
-    assert err.endswith(EARLY)
-    assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") > 0
-
-
 def test_run_without_a_step_keeps_the_old_table(folder, capsys, monkeypatch):
     monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig({("fixed.read", 1): DeviceError("gone")}))
     assert refused(capsys, *FOLLOW) == "cotarget follow: gone"
     assert (folder / "out.csv").read_text() == OLD
     assert not (folder / "out.mp4").exists()
-
-
-def test_interrupted_replay_keeps_the_steps_so_far(folder, capsys, monkeypatch):
-    def interrupted(*args, **options):
-        for number, each in enumerate(follow(*args, **options)):
-            if number == FRAMES:
-                raise KeyboardInterrupt
-            yield each
-
-    record(folder / "run", folder / "rig_calibration.json", seconds=0.6)
-    monkeypatch.setattr("cotarget.pipeline.follow", interrupted)
-    status, out, err = call(capsys, "replay", "run", *FOLLOW[-4:])
-    assert (status, out, err) == (130, "", f"cotarget replay: interrupted{EARLY}")
-    assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
 
 
 def test_interrupted_detect_keeps_the_tracks_so_far(folder, capsys, monkeypatch):

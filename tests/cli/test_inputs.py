@@ -6,7 +6,6 @@ import cv2
 import pytest
 
 from cotarget.backends import OPENERS
-from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
 from cotarget.files import PartFile
 from tests.support.commands import (
@@ -53,7 +52,7 @@ def made(tmp_path_factory):
     (folder / "captures").mkdir()
     (folder / "captures" / "a.png").write_bytes(b"a photo")
     write_index(folder / "captures", [capture("a.png")])
-    save_calibration(folder / "captures" / "calibration.json", true_calibration(RigConfig()))
+    true_calibration(RigConfig()).save(folder / "captures" / "calibration.json")
     return folder
 
 
@@ -103,19 +102,6 @@ def test_output_that_is_an_input_is_refused(folder, capsys, command, name):
     assert "is read or written" in line
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ("point",),
-        ("calibrate", "--out", "new.json"),
-        ("aim", "--calibration", "rig_calibration.json", "--pixel", "9", "9", "--depth", "9"),
-    ],
-)
-def test_recording_is_refused_by_commands_that_move_a_rig(folder, capsys, command):
-    line = refused(capsys, *command, "--rig", "replay.toml")
-    assert line.startswith(f"cotarget {command[0]}: replay.toml: backend is 'replay'; ")
-
-
 @pytest.mark.parametrize("name", ["loop", "pipe", "/dev/null", "run"])
 def test_output_that_is_no_file_is_refused(folder, capsys, name):
     if name == "pipe":
@@ -141,15 +127,6 @@ def test_output_that_is_stdout_or_stderr_is_refused(folder, capsys, tmp_path):
                 os.close(kept)
             assert status == 1
             assert "is this command's own stdout or stderr" in err
-
-
-def test_output_that_is_a_link_is_written_at_its_target(folder, capsys, tmp_path):
-    goal, link = tmp_path / "goal.csv", tmp_path / "link.csv"
-    goal.write_text(OLD)
-    link.symlink_to(goal)
-    assert call(capsys, *DETECT[:-3], "--csv", link)[0] == 0
-    assert link.is_symlink()
-    assert goal.read_text().startswith("frame,t,track")
 
 
 @pytest.mark.parametrize("name", ["calibration.json", "calib", "left.txt"])

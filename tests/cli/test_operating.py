@@ -5,14 +5,12 @@ import json
 import os
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
 
 from cotarget.backends import OPENERS
-from cotarget.calibration import save_calibration
-from cotarget.config import BoardConfig, RigConfig, parse_config
+from cotarget.config import RigConfig
 from cotarget.drivers import ptu_d46
 from cotarget.emulators.emulation import copied_tables
 from cotarget.errors import EmergencyStopError
@@ -33,7 +31,7 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "stops.toml").write_text("[sim]\n" + STOP_FILE)
     (tmp_path / "hw.toml").write_text(HARDWARE + STOP_FILE)
     (tmp_path / "run").mkdir()
-    save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
+    true_calibration(RigConfig()).save(tmp_path / "good.json")
     return tmp_path
 
 
@@ -133,16 +131,6 @@ def test_latency_refuses_a_clearly_negative_delay(folder, capsys, monkeypatch, d
         assert json.loads(out)["measured"] == {"sim.zoom.latency_s": configured, "sim.head.command_delay_s": 0.04}
 
 
-@pytest.mark.parametrize(("command", "words"), [
-    ("emulate", ("head.silence", "head.limit-hit", "fixed.stall", "zoom.gone")),
-    ("follow", ("status:", "3", "4", "130")),
-])  # fmt: skip
-def test_help_lists_faults_and_exit_statuses(capsys, command, words):
-    status, out, _ = call(capsys, command, "--help")
-    assert status == 0
-    assert {word.strip(",;") for word in out.split()} >= set(words)
-
-
 @pytest.fixture
 def resets(monkeypatch):
     """Serial ports whose heads would have been reset."""
@@ -197,13 +185,6 @@ def test_calibrate_needs_the_size_of_a_real_board_in_metres(folder, capsys, mark
     (folder / "hw.toml").write_text(mark + HARDWARE + "[board]\nsquare = 0.025\n")
     assert "square" not in refused(capsys, *calibrate)
     assert not (folder / "new.json").exists()
-
-
-def test_board_prints_its_table_of_rig_toml(folder, capsys):
-    status, out, _ = call(capsys, "board", "--out", "board.svg", "--board", "7x6", "--kind", "charuco")
-    assert status == 0
-    said = tomllib.loads(out[out.index("[board]") :])
-    assert parse_config(said).board == BoardConfig("charuco", (7, 6), 0.025)
 
 
 def test_tables_copied_for_an_emulated_rig_have_absolute_paths(tmp_path):

@@ -198,12 +198,8 @@ def _read(terminal):
 
 
 def test_json_has_no_negative_zeros(capsys):
-    print_json({"a": -0.0, "b": [-0.0, {"c": np.float64(-0.0)}], "d": -1.5, "e": None, "f": "-0.0", "g": True})
-    assert json.loads(capsys.readouterr().out) == {
-        "a": 0.0, "b": [0.0, {"c": 0.0}], "d": -1.5, "e": None, "f": "-0.0", "g": True,
-    }  # fmt: skip
-    print_json({"a": -0.0})
-    assert capsys.readouterr().out == '{\n  "a": 0.0\n}\n'
+    print_json({"a": -0.0, "b": [-0.0, {"c": np.float64(-0.0)}], "d": "-0.0"})
+    assert json.dumps(json.loads(capsys.readouterr().out)) == '{"a": 0.0, "b": [0.0, {"c": 0.0}], "d": "-0.0"}'
 
 
 @pytest.fixture

@@ -1,21 +1,17 @@
 """Selection of one of several targets by options, or by a recording."""
 
 import argparse
-import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from cotarget.calibration import save_calibration
 from cotarget.cli.following import POLICIES, Selection, add_selection
-from cotarget.config import RigConfig
 from cotarget.control import selection as selectors
 from cotarget.control.selection import Candidate
 from cotarget.errors import ConfigError
 from cotarget.rig import PanTiltLimits
 from cotarget.tracking.track import Track
-from tests.support.commands import call, true_calibration
 
 SIZE = (640, 480)
 LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)
@@ -86,17 +82,3 @@ def test_unmatched_selection_is_reported_with_the_tracks_seen(arguments, recorde
 def test_invalid_recorded_selection_is_named_as_recorded(recorded):
     with pytest.raises(ConfigError, match=f"^the recorded {next(iter(recorded))}"):
         chosen(recorded=recorded)
-
-
-@pytest.mark.slow
-@pytest.mark.render
-def test_follow_passes_the_selection_on(tmp_path, capsys):
-    (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
-    save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
-    command = ("follow", "--rig", tmp_path / "rig.toml", "--calibration", tmp_path / "good.json", "--target", "book")
-    for number, state in (("1", "following"), ("9", "searching")):
-        status, out, err = call(capsys, *command, "--seconds", "0.3", "--track", number)
-        printed = json.loads(out)
-        assert status == (0 if state == "following" else 4)
-        assert printed["states"][state] >= printed["steps"] - 4  # a track needs four detections
-        assert ("--track: " in err) == (state == "searching")

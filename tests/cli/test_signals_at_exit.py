@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
 from tests.support.commands import true_calibration
 from tests.support.safety_rigs import DEADLINE_S
@@ -234,7 +233,7 @@ def test_program_keeps_its_own_signal_handlers(start):
 def test_follow_ended_by_a_signal_halts_the_head(start, tmp_path, number, status, said):
     """A second signal comes while the head is being halted; the table is completed afterwards."""
     (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
-    save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
+    true_calibration(RigConfig()).save(tmp_path / "good.json")
     child = start(FOLLOW)
     child.wait_for("moved")
     child.signal(number)

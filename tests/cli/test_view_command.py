@@ -53,23 +53,6 @@ def test_a_frustum_ends_at_the_corners_of_the_image(world, camera, t, depth):
     np.testing.assert_allclose(independent[:, 0], border, atol=NEAR_PX)
 
 
-def test_zoom_frustum_follows_head_and_lens(world):
-    before, after = (frusta_of(world.truth(), t, {"zoom": 10.0}) for t in (0.0, 5.0))
-    np.testing.assert_array_equal(before["fixed"], after["fixed"])
-
-    def span(lines):
-        return np.linalg.norm(lines[0, 0] - lines[2 * SIDE_POINTS, 0])  # the end's diagonal
-
-    pitch = world.config.sim.zoom.pitch_mm
-    factor = 3000.0 / (world.config.sim.zoom.focal_mm[0] / pitch)
-    assert span(before["zoom"]) / span(after["zoom"]) == pytest.approx(factor, rel=0.03)  # the lens's own curve
-    middle = np.mean(after["zoom"][: 4 * SIDE_POINTS, 0], axis=0) - np.mean(
-        before["zoom"][: 4 * SIDE_POINTS, 0], axis=0
-    )
-    right, up = world.truth().T_world_camera("zoom", 0.0).rotation.as_matrix()[:, :2].T @ middle * [1, -1]
-    assert (right, up) == (pytest.approx(10 * np.sin(0.3), rel=0.05), pytest.approx(-10 * np.sin(0.1), rel=0.3))
-
-
 def test_lines_are_drawn_from_end_to_end(world):
     lines = frusta_of(world.truth(), 5.0)
     geoms = [mujoco.MjvGeom() for _ in range(100)]
@@ -78,16 +61,6 @@ def test_lines_are_drawn_from_end_to_end(world):
         along = geom.mat.reshape(3, 3)[:, 2] * geom.size[2]
         np.testing.assert_allclose(geom.pos, begin, atol=NEAR_M)
         np.testing.assert_allclose(geom.pos + along, end, atol=NEAR_M)
-
-
-def test_copy_of_the_world_keeps_its_state(world):
-    shown, truth = WorldCopy(world.truth()), world.truth()
-    shown.move_to(5.0)
-    mujoco.mj_kinematics(shown.model, shown.data)
-    eye = np.array(shown.data.body("rig/zoom").xpos)
-    np.testing.assert_allclose(eye, truth.set_bodies(5.0).body("rig/zoom").xpos)
-    truth.set_bodies(0.0)
-    np.testing.assert_array_equal(shown.data.body("rig/zoom").xpos, eye)
 
 
 class WallClock:
@@ -128,13 +101,6 @@ def test_snapshots_are_shown_in_real_time_without_catching_up():
     running.watch(moments(clock, [0.0, 0.02, 0.02, 0.5, 0.02]), window, clock.now, clock.sleep)
     np.testing.assert_allclose([at for _, at in window.shown], [0.0, 0.02, 0.12, 0.7, 0.72])
     np.testing.assert_allclose(clock.now(), 0.8)
-
-
-def test_watching_ends_when_the_window_is_closed():
-    clock = WallClock()
-    window = Window(clock, closed_after=2)
-    running.watch(moments(clock, [0.0] * 9), window, clock.now, clock.sleep)
-    assert len(window.shown) == 2
 
 
 @pytest.mark.parametrize("target", [(), ("--target", "book")])

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
 from cotarget.geometry import RigidTransform
 from tests.support.commands import (
@@ -30,6 +29,7 @@ FILES = {
     "rig.toml": '[sim]\nscene = "indoor"\ntargets = ["book"]\n[safety]\nstop_file = "stop"\n',
     "sim.toml": "[sim]\n",
     "dog.toml": "[targets.dog]\nsize = 0.6\ndimension = 'height'\nwanted_px = 200\ndetector = 'motion'\n",
+    "house.toml": '[sim]\ntargets = ["book"]\n[targets.book]\nsize = 23.4\n',
     "narrow.toml": "[safety]\npan_deg = [-5, 5]\n",
     "other_shape.toml": "[sim.fixed]\nsize = [640, 360]\n",
     "typo.toml": "[sim]\nscenery = 1\n",
@@ -59,26 +59,21 @@ SINGLE = f"{OUT} --from single --fixed 'left*.png' --zoom 'right*.png'"
 POSE = "millimetres.json: T_zoom0_fixed"
 # The command line, the exit status, and what the line names.
 CALLS = [
-    ("", USAGE, "COMMAND"),
     ("dance", USAGE, "'dance'", "calibrate"),
     ("demo --seed 1.5", USAGE, "--seed", "'1.5'"),
-    ("demo --seed ²", USAGE, "--seed"),
     ("demo --out film.mp4", FAILED, "film.mp4"),
     ("demo --out out.json/x", FAILED, "out.json/x"),
     # calibrate
-    ("calibrate", USAGE, "--rig", "--from"),
     ("calibrate --rig folder", FAILED, "folder"),
     ("calibrate --rig moon.toml", FAILED, "moon.toml: ", "'moon'", "indoor, outdoor"),
     ("calibrate --rig nameless.toml", FAILED, "nameless.toml: hardware.head.port"),
-    ("calibrate --rig rig.toml --placements 0", USAGE, "--placements", "'0'"),
     ("calibrate --rig rig.toml --out -", FAILED, "-: "),
-    ("calibrate --rig rig.toml --out rig.toml", FAILED, "rig.toml: "),
     ("calibrate --rig rig.toml --out folder", FAILED, "folder: "),
+    ("calibrate --rig replay.toml --out new.json", FAILED, "replay.toml: backend is 'replay'"),
     ("calibrate --rig rig.toml --board 9x6", FAILED, "--board", "--from"),
     ("calibrate --rig rig.toml --kind charuco", FAILED, "--kind", "--from"),
     ("calibrate --rig rig.toml --insist --method sequential", FAILED, "--insist", "--method joint"),
     (f"{OUT} --from grey {PHOTOS}", FAILED, "grey: ", "9x6"),
-    (f"{OUT} --from single {PHOTOS}", FAILED, "3"),
     (f"{OUT} --from folder {PHOTOS}", FAILED, "folder: ", "'left*.png'"),
     (f"{OUT} --from none {PHOTOS}", FAILED, "none: "),
     (f"{OUT} --from folder", FAILED, "folder: ", "index.json"),
@@ -94,46 +89,33 @@ CALLS = [
     (f"{SINGLE} --square 0.1 --board 9by6", USAGE, "--board", "9by6", "9x6"),
     (f"{SINGLE} --square 0.1 --board 2x6", USAGE, "--board", "2x6"),
     (f"{SINGLE} --square 0.1 --board 7x6", FAILED, "single: ", "7x6"),
-    (f"{SINGLE} --square 0.1 --board 7x7", FAILED, "7x7"),
     (f"{SINGLE} --square 25 --board 9x6", FAILED, "--square", "0.025"),
-    (f"{SINGLE} --square 0 --board 9x6", USAGE, "--square"),
-    (f"{OUT} --from single {PHOTOS} --kind circles", USAGE, "--kind", "circles", "charuco"),
     (f"{OUT} --from single {PHOTOS} --kind charuco", FAILED, "single: ", "charuco of 9x6"),
     (f"{OUT} --from single {PHOTOS} --encoders", FAILED, "--encoders", "--rig"),
     # report and board
-    ("report", USAGE, "FILE"),
     ("report list.json", FAILED, "list.json"),
-    ("report film.mp4", FAILED, "film.mp4", "UTF-8"),
     ("report millimetres.json --out page.html", FAILED, POSE, "metres", "--insist"),
     ("report good.json --out film.mp4/page.html", FAILED, "film.mp4/page.html: film.mp4"),
-    ("board", USAGE, "--out"),
     ("board --out new.txt", FAILED, "new.txt", ".pdf, .png, .svg"),
-    ("board --out /dev/null", FAILED, "/dev/null"),
     ("board --out new.pdf --square 25", FAILED, "--square", "0.025"),
-    ("board --out new.pdf --kind ring", USAGE, "--kind", "charuco"),
     # aim
-    (AIM, USAGE, "--depth", "--size-px"),
-    (f"{AIM} --depth 5 --size-px 16", USAGE, "--size-px", "--depth"),
     (f"{AIM} --depth -3", USAGE, "--depth", "-3"),
     (f"{AIM} --depth nan", USAGE, "--depth", "nan"),
     (f"{AIM} --depth 1e300", FAILED, "1e+300"),
     (f"{AIM} --depth 5 --fast", USAGE, "--fast"),
-    (f"{AIM} --depth 5 --ik magic", USAGE, "--ik", "magic", "exact", "paper-table"),
     (f"{AIM} --depth 5 --rig typo.toml", FAILED, "typo.toml", "sim.scenery", "scene"),
+    (f"{AIM} --depth 5 --rig replay.toml", FAILED, "replay.toml: backend is 'replay'"),
     (f"{AIM} --depth 5 --rig other_shape.toml", FAILED, "good.json: ", "640x360", "640x480"),
     (f"{AIM} --depth 0.5 --rig narrow.toml", FAILED, "pan -5 to 5"),
     (f"{AIM} --depth 5 --target dog", FAILED, "--target", "'dog'", "bird, book, person"),
     (f"{AIM} --depth 5 --wanted-px 16", FAILED, "--wanted-px", "--target"),
     (f"{AIM} --depth 5 --target book --wanted-px 5000", FAILED, "--wanted-px", "5000", "640x480"),
     (f"{AIM} --depth 5 --focal-mm 100", FAILED, "--focal-mm", "100", "6 to 72 mm"),
-    (f"{AIM} --depth 5 --focal-mm 5.9", FAILED, "--focal-mm", "6 to 72 mm"),
     (f"{AIM} --size-px 16", FAILED, "--size-px", "--target"),
-    (f"{AIM} --size-px 0 --target book", USAGE, "--size-px"),
     (f"{AIM} --size-px 5000 --target book", FAILED, "--size-px", "book of 0.234 m", "640x480"),
     (f"{AIM} --size-px 1e-320 --target book", FAILED, "--size-px"),
     ("aim --calibration good.json --pixel 640 240 --depth 5", FAILED, "--pixel", "(640, 240)", "640x480"),
     ("aim --calibration good.json --pixel nan 240 --depth 5", FAILED, "--pixel", "(nan, 240)"),
-    ("aim --calibration broken.json --pixel 3 4 --depth 5", FAILED, "broken.json"),
     ("aim --calibration headless.json --pixel 3 4 --depth 5", FAILED, "T_head_zoom"),
     ("aim --calibration millimetres.json --pixel 3 4 --depth 5", FAILED, POSE, "metres", "--insist"),
     ("aim --calibration wide.json --pixel 3 4 --depth 5 --rig rig.toml", FAILED, "wide.json: ", "640x360"),
@@ -145,23 +127,14 @@ CALLS = [
     ("follow --calibration good.json --rig of_nothing.toml --target book", FAILED, "of_nothing.toml: recording"),
     ("follow --calibration wide.json --rig rig.toml --target book", FAILED, "wide.json: ", "640x480", "640x360"),
     ("follow --calibration millimetres.json --rig rig.toml --target book", FAILED, POSE, "metres", "--insist"),
+    ("follow --calibration good.json --rig house.toml --target book", FAILED, "targets.book.size: 23.4", "--insist"),
     (f"{FOLLOW} --seconds 0", USAGE, "--seconds"),
-    (f"{FOLLOW} --policy best", USAGE, "--policy", "'best'", "first-come"),
     (f"{FOLLOW} --click 640 3", FAILED, "--click", "(640, 3)", "640x480"),
-    (f"{FOLLOW} --click -1 3", FAILED, "--click", "(-1, 3)"),
-    (f"{FOLLOW} --click 3 nan", USAGE, "--click", "nan"),
-    (f"{FOLLOW} --track 0", USAGE, "--track", "'0'"),
-    (f"{FOLLOW} --track 1 --policy first-come", USAGE, "--track", "--policy"),
-    (f"{FOLLOW} --csv good.json", FAILED, "good.json: "),
     (f"{FOLLOW} --csv out.csv --video out.csv", FAILED, "out.csv: "),
     (f"{FOLLOW} --video none/out.mp4", FAILED, "none/out.mp4"),
-    (f"{FOLLOW} --video -", FAILED, "-: "),
     (f"{FOLLOW} --record film.mp4", FAILED, "film.mp4: "),
-    ("replay none", FAILED, "none: "),
     ("replay folder", FAILED, "folder: "),
-    ("replay film.mp4 --check x", USAGE, "x"),
     # what operates a rig; refused before any device is opened
-    ("point --rig rig.toml --pan-deg x", USAGE, "--pan-deg", "'x'"),
     ("point --rig nameless.toml", FAILED, "nameless.toml: hardware.head.port"),
     ("point --rig replay.toml", FAILED, "replay.toml: backend"),
     ("point --rig rig.toml --pictures film.mp4", FAILED, "film.mp4"),
@@ -170,30 +143,22 @@ CALLS = [
     ("latency --rig hw.toml", FAILED, "http://127.0.0.1:9"),
     ("latency --rig rig.toml --calibration headless.json", FAILED, "T_head_zoom"),
     ("latency --rig rig.toml --calibration millimetres.json", FAILED, POSE, "metres", "--insist"),
-    ("stop", USAGE, "--rig"),
     ("stop --rig unstoppable.toml", FAILED, "unstoppable.toml: safety.stop_file: 5"),
-    ("clear", USAGE, "--rig"),
     ("clear --rig sim.toml", FAILED, "sim.toml: ", "[safety] stop_file"),
     ("reset-head --rig sim.toml --yes", FAILED, "sim.toml: "),
     ("reset-head --rig nameless.toml --yes", FAILED, "nameless.toml: "),
     ("reset-head --rig hw.toml --yes", FAILED, NO_PORT),
-    ("emulate", USAGE, "--write"),
     ("emulate --rig hw.toml --write new.toml", FAILED, "hw.toml: backend"),
     ("emulate --write new.toml --user root", FAILED, "--user", "COTARGET_PASSWORD"),
     ("emulate --write new.toml --fault silence", FAILED, "--fault", "'silence'", "fixed., head., zoom."),
     ("emulate --write new.toml --fault head.rust", FAILED, "--fault", "'head.rust'", "garbage", "silence"),
     ("emulate --write new.toml --head 65536", USAGE, "--head", "'65536'"),
-    ("emulate --rig sim.toml --write sim.toml", FAILED, "sim.toml: "),
     # what shows and inspects
     ("view --port 5", FAILED, "--port", "--browser"),
     ("view --calibration good.json", FAILED, "--calibration", "--target"),
     ("view --target dog", FAILED, "--target", "'dog'"),
     ("view --rig hw.toml", FAILED, "hw.toml: backend"),
-    ("view --rig rig.toml --target bird", FAILED, "rig.toml: ", '[sim] targets = ["book", "bird"]'),
-    ("detect film.mp4", USAGE, "--target", "--csv"),
     ("detect text.mp4 --target bird --csv new.csv", FAILED, "text.mp4"),
-    ("detect folder --target bird --csv new.csv", FAILED, "folder: "),
-    ("detect film.mp4 --target dog --csv new.csv", FAILED, "--target", "'dog'"),
     (f"{DETECT} none/new.csv", FAILED, "none/new.csv"),
     (f"{DETECT} new.csv --labels other.csv", FAILED, "other.csv", "frame, x_px"),
     (f"{DETECT} new.csv --video new.txt", FAILED, "new.txt", ".mp4"),
@@ -241,10 +206,10 @@ def made(tmp_path_factory):
     good = true_calibration(RigConfig())
     gamma = good.zoom_head.T_zoom0_fixed
     wide_apart = RigidTransform.from_components(1000 * gamma.translation, gamma.rotation)
-    save_calibration(folder / "good.json", good)
-    save_calibration(folder / "wide.json", true_calibration(RigConfig(), zoom_size=(640, 360)))
-    save_calibration(folder / "headless.json", true_calibration(RigConfig(), with_head=False))
-    save_calibration(folder / "millimetres.json", with_zoom_head(good, T_zoom0_fixed=wide_apart))
+    good.save(folder / "good.json")
+    true_calibration(RigConfig(), zoom_size=(640, 360)).save(folder / "wide.json")
+    true_calibration(RigConfig(), with_head=False).save(folder / "headless.json")
+    with_zoom_head(good, T_zoom0_fixed=wide_apart).save(folder / "millimetres.json")
     for name, camera in (("no_fixed", "zoom"), ("no_zoom", "fixed")):
         cv2.imwrite(str(folder / name / "a.png"), board_photo())
         write_index(folder / name, [capture("a.png", camera)])

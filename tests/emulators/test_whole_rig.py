@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from cotarget.backends import describe, load_config
-from cotarget.calibration import load_calibration, save_calibration
+from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.emulators.emulation import FAULTS
 from cotarget.emulators.process import EmulatedRig
@@ -93,7 +93,7 @@ def emulated(folder, tables, *options):
     """An emulated rig whose true calibration is at `calibration`; nothing may be written to stderr."""
     with EmulatedRig(folder, tables, *options, environment={"COTARGET_PASSWORD": PASSWORD}) as rig:
         rig.calibration = folder / "true.json"
-        save_calibration(rig.calibration, true_calibration(SimWorld(rig.sim, rendered=())))
+        true_calibration(SimWorld(rig.sim, rendered=())).save(rig.calibration)
         yield rig
     assert rig.errors() == ""
 
@@ -267,7 +267,7 @@ def test_a_book_is_aimed_at_and_the_replay_gives_the_same(rig, capsys):
     book = config.target("book")
     assert book.wanted_px == rig.sim.target("book").wanted_px / 2  # as the viewfinder's pictures are half
     spec = describe(config)
-    calibration = load_calibration(rig.calibration).for_streams(spec.fixed.size, spec.zoom.size)
+    calibration = Calibration.load(rig.calibration).for_streams(spec.fixed.size, spec.zoom.size)
     there = aim(
         calibration,
         np.array([x, MOUNT_M - z, y]),
@@ -313,7 +313,7 @@ def test_a_rig_is_calibrated_over_the_wire_at_two_focal_lengths(rig, capsys):
     files = ["--rig", rig.hardware_toml, "--out", out]
     status, said, err = run(capsys, "calibrate", *files, "--placements", 8, "--stops", 2)
     assert status == 0, err
-    said, truth, found = json.loads(said), load_calibration(rig.calibration), load_calibration(out)
+    said, truth, found = json.loads(said), Calibration.load(rig.calibration), Calibration.load(out)
     assert said["baseline_m"] == pytest.approx(
         np.linalg.norm(truth.zoom_head.T_zoom0_fixed.translation), abs=BASELINE_M
     )

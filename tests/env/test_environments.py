@@ -9,7 +9,6 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 from cotarget.config import RigConfig
-from cotarget.detection import Detection
 from cotarget.env import FOLLOW, SCHEDULE, Follow, PipelinePolicy, Schedule, SchedulingPolicy
 from cotarget.env.common import RIG_FEATURES, Units
 from cotarget.env.follow import TRACK_FEATURES
@@ -82,28 +81,6 @@ def test_an_environment_in_a_vector_does_what_it_does_alone(opened):
         (flat(o).tolist(), r, i["box_wide"].tolist()) for o, r, i in run(make_book(), lambda _: STILL, 7, 0.4)
     ]
     assert first[-1] != second[-1]
-
-
-@pytest.mark.parametrize(("name", "action", "chosen"), [
-    (SCHEDULE, np.int64(0), {"kind": "bird", "seconds": 4.0}),
-    pytest.param(FOLLOW, STILL, {"target": "book", "observation": "images", "seconds": 1.0},
-                 marks=[pytest.mark.slow, pytest.mark.render]),
-])  # fmt: skip
-def test_schedule_and_an_own_rig_in_a_vector_do_what_they_do_alone(field, name, action, chosen):
-    how, seconds = ("async", 0.4) if name == FOLLOW else ("sync", 2.0)
-    context = {"vector_kwargs": {"context": "spawn"}} if how == "async" else {}
-    vector = gymnasium.make_vec(name, num_envs=2, vectorization_mode=how, rig=field, **context, **chosen)
-    alone = run(gymnasium.make(name, rig=field, **chosen), lambda _: action, 7, seconds)
-    first, _ = in_vector(vector, seconds, action)
-    assert first == [(flat(o).tolist(), r, i["box_wide"].tolist()) for o, r, i in alone]
-
-
-def test_a_vector_starts_a_new_episode_where_one_ends():
-    vector = gymnasium.make_vec(FOLLOW, num_envs=2, vectorization_mode="sync", target="book", seconds=0.2)
-    vector.reset(seed=3)
-    ends = [vector.step(np.stack([STILL, STILL]))[3].tolist() for _ in range(7)]
-    assert ends == [[False] * 2] * 4 + [[True] * 2] + [[False] * 2] * 2
-    vector.close()
 
 
 # ---------------------------------------------------------------- seeds
@@ -180,21 +157,6 @@ def test_track_features_follow_the_true_box(field):
     assert abs(moved[0]) > 20.0  # px/s: it walks
     assert track["du"] == pytest.approx(2 * moved[0] / width, rel=0.3)
     assert track["dv"] == pytest.approx(2 * moved[1] / height, abs=0.05)
-    env.close()
-
-
-def test_rates_are_in_half_images_a_second(field):
-    """A box moves by 64 px/s to the right and by 48 px/s down in 640x480: 0.2 each."""
-    env = Follow("person", rig=field, seconds=3.0)
-    env.reset(seed=0)
-    size_px = np.array([40.0, 100.0])
-    env.episode.detector.detect = lambda frame: [
-        Detection(np.array([100.0, 80.0]) + frame.t * np.array([64.0, 48.0]), size_px, 1.0, False)
-    ]
-    for _ in range(60):
-        observation, *_ = env.step(STILL)
-    track = named(observation)
-    assert (track["du"], track["dv"]) == pytest.approx((0.2, 0.2), rel=0.05)
     env.close()
 
 

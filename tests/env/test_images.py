@@ -29,14 +29,6 @@ def test_images_pass_the_checker(field, make):
     env.close()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["cotarget/Follow-v0", "cotarget/Schedule-v0"])
-def test_the_checker_passes_rendering_too(name):
-    env = gymnasium.make(name, observation="images", seconds=1.0, render_mode="rgb_array")
-    check_env(env.unwrapped)
-    env.close()
-
-
 def test_render_shows_both_views():
     env = gymnasium.make(FOLLOW, target="book", seconds=1.0, render_mode="rgb_array")
     env.reset(seed=0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import RigConfig, SimConfig, SimEffects
-from cotarget.env import FOLLOW, SCHEDULE, Follow, PipelinePolicy, Schedule, SchedulingPolicy
+from cotarget.env import FOLLOW, Follow, PipelinePolicy, Schedule
 from cotarget.env.schedule import CANDIDATE_FEATURES, SLOTS
 from cotarget.evaluation import closeup_of, true_calibration
 from cotarget.geometry import pose
@@ -173,17 +173,6 @@ def test_the_pipeline_asked_again_before_the_next_step_says_the_same(field):
         assert policy(observation) is action
         assert env.episode.rig.clock.now() == t
         observation, *_ = env.step(action)
-    env.close()
-
-
-@pytest.mark.slow
-def test_the_pipelines_policy_serves_and_chance_does_not():
-    env = gymnasium.make(SCHEDULE, kind="bird", seconds=9.0)
-    env.action_space.seed(0)
-    policies = (SchedulingPolicy(env, "most-served"), lambda _: env.action_space.sample())
-    served = [run(env, policy, seed=6)[-1][2]["served"] for policy in policies]
-    assert served[0] >= 2
-    assert served[1] == 0
     env.close()
 
 

@@ -108,18 +108,6 @@ def test_an_impossible_or_too_slow_rig_is_refused_in_one_line(change, said):
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("part", ["fixed", "zoom"])
-def test_the_slowest_allowed_camera_works(field, part):
-    camera = dataclasses.replace(getattr(field.sim, part), rate_hz=1.0, latency_s=1.0)
-    rig = dataclasses.replace(
-        simulated(field, **{part: camera}), safety=SafetyConfig(watchdog_s=3.0, max_frame_age_s=9.0)
-    )
-    for make, action in ((Follow, STILL), (Schedule, 0)):
-        env = make("bird", rig=rig, seconds=3.0)
-        assert run(env, lambda _, action=action: action, seed=0, seconds=0.4)[-1][2]["t"] > 0
-        env.close()
-
-
 @pytest.mark.parametrize(("old", "new", "seen"), [
     ("", "", None),
     ('euler="99 0 0"', 'euler="95 0 0"', None),  # not as steep
@@ -166,11 +154,3 @@ def test_a_world_ends_with_its_episode(field, make, action):
             assert [world() is not None for world in worlds] == [False] * seed + [True]
         env.close()
         assert worlds[-1]() is None
-
-
-@pytest.mark.parametrize(
-    "make", [lambda rig: Follow("bird", rig=rig, seconds=1.0), lambda rig: Schedule("bird", rig=rig)]
-)
-def test_a_targets_detector_does_not_count(field, make):
-    told = {**field.targets, "bird": dataclasses.replace(field.target("bird"), detector="speck")}
-    assert make(dataclasses.replace(field, targets=told)).target == make(field).target

@@ -17,7 +17,7 @@ import pytest
 
 from cotarget import errors
 from cotarget.backends import open_recording
-from cotarget.calibration import load_calibration, save_calibration
+from cotarget.calibration import Calibration
 from cotarget.cli.main import main
 from cotarget.config import parse_config
 from cotarget.demo import summary
@@ -74,7 +74,7 @@ def old(tmp_path, monkeypatch):
 
 def test_v010_calibration_loads():
     """That all of it is written again as it was is tested below."""
-    then, found = read(OLD / "calibration.json"), load_calibration(OLD / "calibration.json")
+    then, found = read(OLD / "calibration.json"), Calibration.load(OLD / "calibration.json")
     lens, head = found.zoom_head.lens, found.zoom_head
     assert found.fixed.lens.focal_px == (then["fixed"]["fx"], then["fixed"]["fy"])
     assert found.fixed.lens.center_px == (then["fixed"]["cx"], then["fixed"]["cy"])
@@ -99,17 +99,17 @@ def test_v010_calibration_loads():
 
 
 def test_v010_calibrations_by_other_methods_load():
-    photos, sequential = (load_calibration(OLD / f"calibration_{name}.json") for name in ("photos", "sequential"))
+    photos, sequential = (Calibration.load(OLD / f"calibration_{name}.json") for name in ("photos", "sequential"))
     assert (photos.zoom_head.T_head_zoom, photos.pitch_mm, photos.residuals.handeye_rms_px) == (None, None, None)
     assert (sequential.covariance, sequential.held_out) == (None, None)
-    plain = load_calibration(OLD / "calibration_plain.json")
+    plain = Calibration.load(OLD / "calibration_plain.json")
     assert (plain.residuals, plain.covariance, plain.board, plain.views) == (None, None, None, ())
 
 
 @pytest.mark.parametrize("name", ["calibration", "calibration_photos", "calibration_sequential", "calibration_plain"])
 def test_calibration_json_is_written_as_before(name, tmp_path):
     then = read(OLD / f"{name}.json")
-    save_calibration(tmp_path / "now.json", load_calibration(OLD / f"{name}.json"))
+    Calibration.load(OLD / f"{name}.json").save(tmp_path / "now.json")
     now = read(tmp_path / "now.json")
     assert_keys("calibration_json.txt", now, may_lack=["provenance."])
     before, after = (dict(enumerate(leaves(each))) for each in (then, now))
@@ -126,7 +126,7 @@ def test_a_covariance_has_the_listed_parameters(tmp_path):
     table["covariance"]["parameters"][0] = UNKNOWN
     (tmp_path / "c.json").write_text(json.dumps(table))
     with pytest.raises(CalibrationError) as caught:
-        load_calibration(tmp_path / "c.json")
+        Calibration.load(tmp_path / "c.json")
     assert_listed(
         "covariance_parameters.txt", {re.sub(r"\[\d+]", "[N]", name) for name in last_list(str(caught.value))}
     )
@@ -158,7 +158,7 @@ def test_v010_captures_are_calibrated(old, capsys):
     keys = {re.sub(r"\d+", "N", key) for key in keys_in(now)}
     assert_listed("printed.txt", {f"calibrate: {key}" for key in keys}, begins="calibrate:")
     assert_keys("calibration_json.txt", read(old / "now.json"), may_lack=[*OF_SESSIONS, "provenance.photos"])
-    found, before = load_calibration(old / "now.json"), load_calibration(OLD / "calibration.json")
+    found, before = Calibration.load(old / "now.json"), Calibration.load(OLD / "calibration.json")
     for name in ("T_zoom0_fixed", "T_head_zoom"):
         apart = getattr(found.zoom_head, name).inv() * getattr(before.zoom_head, name)
         assert np.linalg.norm(apart.translation) < CAPTURES_M
@@ -449,6 +449,7 @@ def test_v010_recording_of_every_call_is_replayed():
     spec = recording.spec
     assert (spec.fixed.size, spec.zoom.size, spec.zoom.still_size) == ((4, 3), (4, 3), (8, 6))
     assert (spec.zoom.focal_range, spec.real_time) == ((100.0, 1200.0), True)
+    assert (spec.fixed.rate_hz, spec.zoom.rate_hz, spec.head.delay_s) == (25.0, 25.0, 0.04)  # of the configuration
     assert dataclasses.astuple(spec.head.limits) == ((-2.5, 2.5), (-0.75, 0.5), math.inf, 4.0, 0.0)
     assert (recording.target, recording.ending, recording.truncated) == ("bird", "complete", False)
     assert list(every_call(Replay(recording).rig)) == REPLAYED

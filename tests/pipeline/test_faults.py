@@ -11,8 +11,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from cotarget.backends import open_recording
-from cotarget.calibration import load_calibration
 from cotarget.config import RigConfig as Config
 from cotarget.config import SafetyConfig, SimConfig
 from cotarget.control.selection import POLICIES, Chosen
@@ -21,7 +19,6 @@ from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.evaluation import TruthDetector, true_calibration
 from cotarget.fusion import FusionSettings
 from cotarget.pipeline import GONE_S, STALE_S, WAIT_S, State, follow
-from cotarget.recording.replay import Replay, until_end
 from cotarget.rig import READ_TIMEOUT_S, Frame
 from cotarget.sim.world import SimWorld
 from tests.support.formula_rig import (
@@ -43,8 +40,6 @@ from tests.support.formula_rig import (
     spans,
     still,
 )
-from tests.support.recorded_run import ToyDevices, calibration_file, record
-from tests.support.recorded_run import run as recorded
 from tests.support.rigs import guarded, rig_of
 
 FAULT = 1.5  # when it happens [s]; by then the target is followed
@@ -374,20 +369,6 @@ def test_a_zoom_frame_that_is_there_costs_no_time():
     assert all(step.zoom.t == pytest.approx(step.fixed.t) for step in steps)
 
 
-def test_a_zoom_camera_that_was_blind_is_so_in_the_replay(tmp_path):
-    """Though the errors came one by one, not one of them ended the run."""
-    path = calibration_file(tmp_path)
-    failing = {("zoom.read", n): StaleFrameError("it is lost") for n in range(9, 20)}
-    steps = record(tmp_path / "run", path, ToyDevices(failing))
-    recording = open_recording(tmp_path / "run")
-    played = Replay(recording)
-    again = list(until_end(recorded(played.rig, load_calibration(recording.calibration), seconds=math.inf)))
-    assert sum("it is lost" in step.reason for step in steps) == 11
-    assert [step.reason for step in again] == [step.reason for step in steps]
-    assert [step.zoom.t for step in again] == [step.zoom.t for step in steps]
-    assert played.differences.same
-
-
 # Targets that are many, out of reach, or not the chosen one
 
 
@@ -410,30 +391,24 @@ class Crowd:
         return [Detection(pixel, np.array([size, 1.4 * size]), 1.0) for pixel in pixels]
 
 
-def test_of_a_hundred_moving_things_one_is_followed():
+NUMBER = 77  # there are more tracks than are known in 3D
+
+
+@pytest.mark.parametrize("choice", ["first", "number", "click"])
+def test_of_a_hundred_moving_things_the_first_or_the_chosen_one_is_followed(choice):
     rig, crowd = FormulaRig(), Crowd()
-    steps = run(rig, crowd, 2.5)
-    followed = {step.target.id for step in steps if step.target is not None}
-    assert followed == {1}
+    number = 0 if choice == "first" else NUMBER
+    pixel = tuple(FIXED.project(crowd.at(number, 0.2))[0])
+    selectors = {"number": Chosen(number=NUMBER + 1), "click": Chosen(pixel=pixel, click_part=8 / rig.fixed.size[0])}
+    steps = run(rig, crowd, 2.5, selector=selectors.get(choice))
+    assert FusionSettings.most_filters < NUMBER
+    assert {step.target.id for step in steps if step.target is not None} == {number + 1}
     assert steps[-1].state is State.FOLLOWING
     assert len([track for track in steps[-1].tracks if track.confirmed]) == 100
     # It is measured at every frame, however many others there are.
     assert all(step.estimate.measured_t == step.fixed.t for step in steps if step.target is not None)
-    assert off(rig, lambda t: crowd.at(0, t), rig.t) < 0.01
-    assert len({round(pan, 1) for _, pan, *_ in rig.moves}) <= 3  # it does not go from one to the other
-
-
-@pytest.mark.parametrize("click", [False, True])
-def test_the_one_chosen_of_a_hundred_is_followed(click):
-    """Though there are more tracks than are known in 3D."""
-    rig, crowd, number = FormulaRig(), Crowd(), 77
-    pixel = tuple(FIXED.project(crowd.at(number, 0.2))[0])
-    selector = Chosen(pixel=pixel, click_part=8 / rig.fixed.size[0]) if click else Chosen(number=number + 1)
-    steps = run(rig, crowd, 2.0, selector=selector)
-    assert number > FusionSettings.most_filters
-    assert {step.target.id for step in steps if step.target is not None} == {number + 1}
-    assert steps[-1].state is State.FOLLOWING
     assert off(rig, lambda t: crowd.at(number, t), rig.t) < 0.01
+    assert len({round(pan, 1) for _, pan, *_ in rig.moves}) <= 3  # it does not go from one to the other
 
 
 @pytest.mark.parametrize(("selector", "reported"), [

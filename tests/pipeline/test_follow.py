@@ -10,7 +10,7 @@ from cotarget.config import RigConfig
 from cotarget.control.selection import FirstCome
 from cotarget.control.zoom import ZoomSettings
 from cotarget.errors import ConfigError
-from cotarget.pipeline import FollowSettings, State, follow
+from cotarget.pipeline import State, follow
 from tests.support.formula_rig import (
     BOOK,
     CALIBRATION,
@@ -137,40 +137,6 @@ def test_target_out_of_sight_before_it_was_chosen_is_lost_at_once():
     assert second[0].reason.startswith("out of sight for 0.6 s")
 
 
-def test_runs_with_the_same_settings_are_independent():
-    """In one of two runs side by side the first target goes, and a second one stays."""
-    settings = FollowSettings()
-    runs = (
-        follow(
-            rig_of(FormulaRig()), CALIBRATION, BOOK, Both(Seer(still, lambda t, end=end: t < end), Seer(beside)),
-            seconds=3.0, settings=settings,
-        )
-        for end in (1.0, 9.0)
-    )  # fmt: skip
-    followed = [[step.target and step.target.id for step in pair] for pair in zip(*runs, strict=False)]
-    assert followed[-1] == [2, 1]
-    assert {second for _, second in followed} == {None, 1}
-
-
-def test_selector_gets_the_time_for_which_a_target_was_seen_well():
-    """Not before the lens has arrived, which takes it more than a second here."""
-
-    class Noting(FirstCome):
-        seen_s = 0.0
-
-        def select(self, candidates, head, limits):
-            self.seen_s = max([0.0, *(each.seen_s for each in candidates)])
-            return super().select(candidates, head, limits)
-
-    selector, rig, true = Noting(), FormulaRig(lens_speed=1.5), 0
-    for _ in follow(rig_of(rig), CALIBRATION, BOOK, Seer(still), selector=selector, seconds=4.0):
-        wanted = 160 * np.linalg.norm(still(0)) / 0.234 * SHORTEST / 692
-        off_px = off(rig, still, rig.t) * rig.lens(rig.t)
-        true += rig.lens(rig.t) / wanted > 0.8 and off_px < 140  # half the height without half the book's
-    assert 1.0 < true / RATE_HZ < 3.0
-    assert selector.seen_s == pytest.approx(true / RATE_HZ, abs=LATENCY + 3 * FRAME_S)
-
-
 def test_step_says_why_the_lens_is_not_as_close_as_wanted():
     steps = run(FormulaRig(), Seer(still), 4.0, closed_loop=False)
     followed = [step.reason for step in steps if step.state is State.FOLLOWING]
@@ -217,17 +183,6 @@ def test_lens_zooms_in_only_as_far_as_the_target_stays_in_the_image():
         rig.focal, true = focal, focal * 692 / SHORTEST
         way_px = math.tan(off(rig, still, t + DELAY + FRAME_S)) * true
         assert way_px + 0.234 / 10.0 * true / 2 < 320  # the way is nearly all along u
-
-
-def test_unreachable_target_says_why_and_leaves_the_head_alone():
-    rig = FormulaRig(replace(WIDE, pan=(-0.05, 0.05)))
-    steps = run(rig, Seer(still), 2.0)
-    assert spans(steps)[-1][0] is State.UNREACHABLE
-    assert not rig.moves
-    for step in [step for step in steps if step.state is State.UNREACHABLE]:
-        assert "beyond the limits pan -2.86" in step.reason
-        assert (step.aim, step.commanded) == (None, (0.0, 0.0, SHORTEST))
-        assert step.target is not None
 
 
 def test_target_that_comes_within_reach_is_followed():

@@ -7,7 +7,6 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS, TargetProfile, parse_config
 from cotarget.detection import make_detector
-from cotarget.estimation import filter_settings
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
 
@@ -44,13 +43,6 @@ def test_tracks_of_an_external_detector_are_confirmed_alike_whatever_detector_th
     settings = tracking_settings(replace(profile, detector=detector), external=True)
     assert settings == tracking_settings(profile, external=True)
     assert (settings.confirm_travel, settings.confirm_score) == (0.0, 0.0)
-
-
-def test_a_general_motion_lies_between_that_of_a_person_and_of_a_bird():
-    person, own, bird = (filter_settings(replace(CAR, motion=m)).motion for m in ("walking", "general", "flying"))
-    assert person.acceleration < own.acceleration < bird.acceleration
-    assert person.speed < own.speed < bird.speed
-    assert person.attitude_sigma < own.attitude_sigma < bird.attitude_sigma
 
 
 @pytest.mark.parametrize(

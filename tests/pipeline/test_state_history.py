@@ -78,11 +78,3 @@ def test_states_in_close_pairs_do_not_multiply_their_rounding(apart):
     off = [history.at(t).pan - rate * t for t in times]
     assert np.sqrt(np.mean(np.square(off))) < 0.5 * step
     assert history.at(39 * RATE_S + apart) is not None  # the newest state is kept
-
-
-def test_states_that_come_fast_are_interpolated_too():
-    history = StateHistory()
-    for t in np.arange(0.0, 1.0, 0.002):
-        history.add(PanTiltState(math.sin(t), 0.0, True, t), ZoomState(1000.0, False, t))
-    for t in np.arange(0.0, 0.99, 0.007):
-        assert history.at(t).pan == pytest.approx(math.sin(t), abs=1e-6)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cotarget.backends import open_recording
-from cotarget.calibration import load_calibration
+from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, parse_config
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.pipeline import State
@@ -118,7 +118,7 @@ def test_events_are_written_and_parsed_to_the_last_bit():
 def test_no_password_is_recorded(tmp_path, calibration_path):
     table = {"backend": "hardware", "hardware": {"fixed": {"url": "http://me:secret@10.0.0.1/", "password": "secret"}}}
     with Recorder(tmp_path / "run", parse_config(table), calibration_path, "bird") as recorder:
-        list(run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=0.1))
+        list(run(recorder.wrap(toy_rig()), Calibration.load(calibration_path), seconds=0.1))
     assert not [path for path in (tmp_path / "run").iterdir() if path.is_file() and b"secret" in path.read_bytes()]
     assert open_recording(tmp_path / "run").config.hardware.fixed["url"] == "http://10.0.0.1/"
 
@@ -128,7 +128,7 @@ def test_the_targets_template_is_copied_into_the_recording(tmp_path, calibration
     cv2.imwrite(str(picture), np.full((4, 5, 3), 99, np.uint8))
     book = dataclasses.replace(DEFAULT_TARGETS["book"], template=picture)
     with Recorder(tmp_path / "run", RigConfig(targets={"book": book}), calibration_path, "book") as recorder:
-        list(run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=0.1))
+        list(run(recorder.wrap(toy_rig()), Calibration.load(calibration_path), seconds=0.1))
     picture.unlink()
     moved = (tmp_path / "run").rename(tmp_path / "elsewhere")
     template = open_recording(moved).config.target("book").template
@@ -235,7 +235,7 @@ def test_a_slow_disk_drops_and_counts_images_of_the_zoom_camera_alone(tmp_path, 
     monkeypatch.setattr(writing, "ZOOM_ROOM", 4 * IMAGE_BYTES)
     steps = []
     with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
-        for step in run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=2.0):
+        for step in run(recorder.wrap(toy_rig()), Calibration.load(calibration_path), seconds=2.0):
             steps.append(step)
         dropped = recorder.dropped
         disk.free.set()
@@ -246,7 +246,7 @@ def test_a_slow_disk_drops_and_counts_images_of_the_zoom_camera_alone(tmp_path, 
     assert recording.steps == len(steps)
     assert len(recording.notes) == 1
     played = Replay(recording)
-    again = list(run(played.rig, load_calibration(calibration_path), seconds=2.0))
+    again = list(run(played.rig, Calibration.load(calibration_path), seconds=2.0))
     assert [step.commanded for step in again] == [step.commanded for step in steps]
     assert played.differences.same
 
@@ -259,7 +259,7 @@ def test_a_run_waits_for_the_disk_to_take_the_fixed_cameras_images(tmp_path, cal
 
     def work():
         with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
-            for step in run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=0.5):
+            for step in run(recorder.wrap(toy_rig()), Calibration.load(calibration_path), seconds=0.5):
                 steps.append(step)
 
     thread = threading.Thread(target=work, daemon=True)
@@ -287,7 +287,7 @@ def test_a_full_disk_ends_the_recording_but_not_the_run(tmp_path, calibration_pa
 
     def work():
         with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
-            steps.extend(run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=2.0))
+            steps.extend(run(recorder.wrap(toy_rig()), Calibration.load(calibration_path), seconds=2.0))
 
     with pytest.raises(CotargetError, match=r"run: .*No space left on device"):
         work()

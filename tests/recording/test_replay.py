@@ -10,14 +10,12 @@ import shutil
 import subprocess
 import sys
 import threading
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cotarget.backends import check, describe, open_recording, open_rig
-from cotarget.calibration import load_calibration
-from cotarget.calibration.file import save_calibration
+from cotarget.calibration import Calibration
 from cotarget.cli.main import main
 from cotarget.config import RigConfig, SafetyConfig, parse_config
 from cotarget.control.selection import Chosen
@@ -32,7 +30,6 @@ from cotarget.sim.world import SimWorld
 from tests.support.commands import true_calibration
 from tests.support.recorded_run import (
     CONFIG,
-    FOCALS,
     LIMITS,
     RATE_HZ,
     SETTINGS,
@@ -75,7 +72,7 @@ def replay(folder, change=lambda rig: rig, **options):
     recording = open_recording(folder)
     played = Replay(recording)
     options = {"seconds": math.inf} | options
-    steps = list(until_end(run(change(played.rig), load_calibration(recording.calibration), **options)))
+    steps = list(until_end(run(change(played.rig), Calibration.load(recording.calibration), **options)))
     return steps, played.differences
 
 
@@ -123,23 +120,6 @@ def test_a_rig_in_real_time_replays_to_the_last_bit(tmp_path):
     assert differences.same
 
 
-def reading_the_clock_twice(rig):
-    clock = SimpleNamespace(now=lambda: rig.clock.now() and rig.clock.now(), sleep_until=rig.clock.sleep_until)
-    return dataclasses.replace(rig, clock=clock)
-
-
-def test_additional_readings_of_the_clock_shift_the_time_only_until_the_next_call(recorded):
-    """The bird flies 0.7 px a frame at 100 px focal length, 10 degrees/s; a few ticks of 0.1 ms are 0.005 degrees."""
-    again, _ = replay(recorded[0], reading_the_clock_twice)
-    aims = [(then.aim, now.aim) for then, now in zip(recorded[1], again, strict=True)]
-    assert [then is None for then, _ in aims] == [now is None for _, now in aims]
-    apart = [math.hypot(then.pan - now.pan, then.tilt - now.tilt) for then, now in aims if then is not None]
-    assert len(apart) > 30
-    assert 0 < math.degrees(max(apart)) < 0.005
-    assert_same([step.detections for step in recorded[1]], [step.detections for step in again])
-    assert_same([step.head for step in recorded[1]], [step.head for step in again])
-
-
 def shifted(rig, pan=0.0, focal_px=0.0, every=1):
     """A rig that gets other commands for head and lens, or only each n-th move."""
     zoom, head, count = Proxy(rig.zoom), Proxy(rig.head), itertools.count(1)
@@ -159,7 +139,7 @@ class Proxy:
 def differences_of(folder, **change):
     recording = open_recording(folder)
     played = Replay(recording)
-    calibration, bird = load_calibration(recording.calibration), CONFIG.target("bird")
+    calibration, bird = Calibration.load(recording.calibration), CONFIG.target("bird")
     with guarded(played.rig, CONFIG.safety) as safe:
         steps = follow(shifted(safe, **change), calibration, bird, Bright(), seconds=math.inf, settings=SETTINGS)
         assert list(until_end(steps))
@@ -196,7 +176,7 @@ def recording_of_track_2(tmp_path_factory):
     path = calibration_file(folder)
     selector = Chosen(number=2)
     with Recorder(folder / "run", CONFIG, path, "bird", selector) as recorder:
-        steps = list(run(recorder.wrap(toy_rig()), load_calibration(path), SECONDS, selector=selector))
+        steps = list(run(recorder.wrap(toy_rig()), Calibration.load(path), SECONDS, selector=selector))
     assert {step.target.id for step in steps if step.target} == {2}
     return folder / "run"
 
@@ -385,19 +365,6 @@ def test_a_replayed_rig_has_the_recorded_spec(tmp_path):
         assert played.spec == spec
 
 
-def test_rates_and_delays_that_an_older_recording_lacks_are_those_of_its_configuration(copy):
-    log = copy / "log.jsonl"
-    first, rest = log.read_bytes().split(b"\n", 1)
-    old = ("fixed_size", "zoom_size", "still_size", "focal_range_px", "pan", "tilt", "speed", "acceleration", "step")
-    facts = {key: json.loads(first)["rig"][key] for key in (*old, "real_time")}
-    log.write_bytes(json.dumps({"rig": facts}).encode() + b"\n" + rest)
-    edit("config", {"sim": {"fixed": {"rate_hz": 20.0}, "head": {"command_delay_s": 0.08}}})(copy)
-    spec = open_recording(copy).spec
-    assert (spec.fixed.rate_hz, spec.zoom.rate_hz) == (20.0, 25.0)
-    assert (spec.head.delay_s, spec.zoom.delay_s) == (0.08, 0.08)
-    assert (spec.fixed.size, spec.zoom.focal_range, spec.head.limits) == (SIZE, FOCALS, LIMITS)
-
-
 def collect(steps, into):
     for step in steps:
         into.append(step)  # steps before a failure stay
@@ -414,7 +381,7 @@ def test_the_error_that_ended_a_run_ends_its_replay(tmp_path, failing):
     error = next(iter(failing.values()))
     steps = []
     with pytest.raises(type(error)), Recorder(tmp_path / "run", CONFIG, path, "bird") as recorder:
-        collect(run(recorder.wrap(toy_rig(failing, real_time=True)), load_calibration(path)), steps)
+        collect(run(recorder.wrap(toy_rig(failing, real_time=True)), Calibration.load(path)), steps)
     recording = open_recording(tmp_path / "run")
     assert not recording.truncated
     assert recording.ending == f"{type(error).__name__}: {error}".removesuffix(": ")
@@ -422,7 +389,7 @@ def test_the_error_that_ended_a_run_ends_its_replay(tmp_path, failing):
     played, again = Replay(recording), []
     expected = error if isinstance(error, CotargetError) else CotargetError()
     with pytest.raises(type(expected), match=str(error) or "the recording ends here"):
-        collect(run(played.rig, load_calibration(path)), again)
+        collect(run(played.rig, Calibration.load(path)), again)
     assert_same(steps, again)
     assert played.differences.same
 
@@ -432,7 +399,7 @@ def test_a_halt_by_another_thread_is_logged_and_does_not_change_the_replay(tmp_p
     steps = []
     with Recorder(tmp_path / "run", CONFIG, path, "bird") as recorder:
         rig = recorder.wrap(toy_rig())
-        for step in run(rig, load_calibration(path), seconds=0.5):
+        for step in run(rig, Calibration.load(path), seconds=0.5):
             steps.append(step)
             watchdog = threading.Thread(target=lambda: rig.clock.now() and rig.head.halt())
             watchdog.start()
@@ -665,7 +632,7 @@ def test_a_simulated_run_is_replayed_to_the_last_bit(tmp_path):
     config = parse_config({"sim": {"scene": "indoor", "targets": ["book"], "seed": 3}})
     target, settings = config.target("book"), FollowSettings()
     path = tmp_path / "exact.json"
-    save_calibration(path, true_calibration(config))
+    true_calibration(config).save(path)
 
     def steps(rig, config, calibration, target, seconds):
         detector = make_detector(target, rig.spec.fixed.rate_hz)
@@ -674,10 +641,10 @@ def test_a_simulated_run_is_replayed_to_the_last_bit(tmp_path):
 
     with Recorder(tmp_path / "run", config, path, "book") as recorder:
         rig = recorder.wrap(SimWorld(config).rig)
-        then = list(steps(rig, config, load_calibration(path), target, 1.2))
+        then = list(steps(rig, config, Calibration.load(path), target, 1.2))
     recording = open_recording(tmp_path / "run")
     known, again = recording.config, Replay(recording)
-    calibration = load_calibration(recording.calibration)
+    calibration = Calibration.load(recording.calibration)
     now = list(until_end(steps(again.rig, known, calibration, known.target(recording.target), math.inf)))
     assert State.FOLLOWING in {step.state for step in then}
     assert_same(then, now)

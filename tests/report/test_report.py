@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from cotarget import cli
-from cotarget.calibration import Covariance, HeldOut, Options, Rejected, calibrate_views, save_calibration
+from cotarget.calibration import Covariance, HeldOut, Options, Rejected, calibrate_views
 from cotarget.cli.calibrating import calibration_summary
-from cotarget.errors import CalibrationError, ConfigError
+from cotarget.errors import CalibrationError
 from cotarget.report.analysis import (
     JITTER_GROUP,
     Analysis,
@@ -34,7 +34,6 @@ from cotarget.report.text import advice, correlations, digits, judge, percent, v
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, SIZES, Lens, Stop, Truth
 from experiments.calibration.synthetic.views import Placing, synthetic_views
-from tests.support.full_disk import SAID, full_disk
 from tests.support.rigs import with_zoom_head
 from tests.support.synthetic_calibration import BOARD, NOISE_PX, POINTS, drawn_at_stops
 
@@ -167,16 +166,6 @@ def test_verdict_agrees_with_the_measured_pointing_error(plain, stops):
         f"({digits(last.rms * last.focal_px)} px at {last.focal_px:.0f} px, the longest focal length"
         in judge(stops).text
     )
-
-
-def test_verdict_names_the_worst_focal_length_between_zoom_samples(stops):
-    found = analyse(stops)
-    at = found.at
-    worse = replace(at[0], focal_px=1000.0, rms=2 * max(one.rms for one in at))
-    error = f"{digits(np.degrees(worse.rms))} degrees ({digits(worse.rms_px)} px)"
-    said = f"and to {error} between its zoom samples, at 1000 px"
-    assert said in judge(stops, replace(found, between=(worse,))).text
-    assert "between its zoom samples" not in judge(stops, replace(found, between=())).text
 
 
 def without_covariance(method):
@@ -387,41 +376,16 @@ def test_number_formatting():
     assert [percent(x) for x in (0.0004, 0.03, 1.0)] == ["0.04 %", "3 %", "100 %"]
 
 
-def test_report_command_fails_in_one_line_and_keeps_the_old_page(plain, tmp_path, capsys):
+def test_report_command_keeps_the_old_page_unless_all_is_written(plain, tmp_path, capsys):
     source, page = tmp_path / "calibration.json", tmp_path / "page.html"
-    save_calibration(source, bare(plain, covariance=None))
+    bare(plain, covariance=None).save(source)
     page.write_text("old")
-
-    def fails(*arguments):
-        assert cli.main(["report", *(str(a) for a in arguments)]) == 1
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
-        assert page.read_text() == "old"
-        return said
-
-    assert "no such file" in fails(tmp_path / "none.json", "--out", page)
-    (tmp_path / "broken.json").write_text("{")
-    assert "is not JSON" in fails(tmp_path / "broken.json", "--out", page)
-    assert "its folder does not exist" in fails(source, "--out", tmp_path / "none" / "page.html")
-    assert "something else" in fails(source, "--out", source)
     (tmp_path / "page_pictures").write_text("a file")
-    assert "page_pictures" in fails(source, "--out", page)
+    command = ["report", str(source), "--out", str(page)]
+    assert cli.main(command) == 1
+    assert "page_pictures" in capsys.readouterr().err
+    assert page.read_text() == "old"
     (tmp_path / "page_pictures").unlink()
-    assert cli.main(["report", str(source), "--out", str(page)]) == 0
+    assert cli.main(command) == 0
     assert judge(bare(plain, covariance=None)).text in capsys.readouterr().out
     assert page.read_text().startswith("<!DOCTYPE html>")
-
-
-@pytest.mark.slow
-def test_full_disk_leaves_no_partial_report(plain, tmp_path):
-    """There is room for some of its pictures, and none for the page."""
-    page = tmp_path / "page.html"
-    with full_disk(60_000), pytest.raises(ConfigError, match=f"page.html: cannot be written: {SAID}"):
-        write_report(page, plain)
-    assert not list(tmp_path.iterdir())
-    write_report(page, bare(plain, covariance=None))
-    before = page.read_bytes()
-    with full_disk(), pytest.raises(ConfigError):
-        write_report(page, bare(plain, covariance=None))
-    assert page.read_bytes() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html", "page_pictures"]

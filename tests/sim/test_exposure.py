@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import parse_config
-from cotarget.sim.render.opengl import Canvas, mujoco
+from cotarget.sim.render.opengl import Canvas
 from cotarget.sim.world import SimWorld
 
 pytestmark = pytest.mark.render
@@ -127,23 +127,3 @@ def test_a_window_is_the_part_of_the_whole_picture(monkeypatch):
     # Wings apart, which beat: the sky and the trunk in the window are as they were.
     assert np.median(inside) == 0
     assert math.isclose(float(np.percentile(inside, 40)), 0.0)
-
-
-def test_pictures_with_and_without_multisampling_do_not_change_one_another():
-    """One OpenGL context draws both, also of the largest size, in any order."""
-    with (w := world()).rig:
-        size, model = w.rig.fixed.size, w.truth().model
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    canvas = Canvas(model, size, shadows=False)
-    eye, axes = np.array([0.0, 0.0, 1.6]), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-
-    def picture(multisampled):
-        canvas.look(data, 0, 1)
-        return canvas.draw(eye, axes, (-0.5, 0.5, -0.4, 0.4), size, multisampled=multisampled)
-
-    first = {multisampled: picture(multisampled) for multisampled in (True, False)}
-    assert (first[True] != first[False]).any()
-    for multisampled in (False, True, True, False, True):
-        np.testing.assert_array_equal(picture(multisampled), first[multisampled])
-    canvas.close()

@@ -2,13 +2,13 @@
 
 import math
 import tracemalloc
-from bisect import bisect_right
 
 import numpy as np
 import pytest
 
 from cotarget.config import RigConfig, SimCamera, SimConfig, SimEffects, SimHead, SimZoomCamera
 from cotarget.geometry import pose
+from cotarget.sim import motion
 from cotarget.sim.devices import SimClock, SimPanTilt, SimStream, SimZoomStream, head_drive, lens_drive, rig_spec
 from cotarget.sim.motion import HISTORY_S, Axis, trapezoid
 from cotarget.sim.world import SimWorld
@@ -149,51 +149,27 @@ def test_the_lens_steps_and_takes_its_time():
     assert math.log(said / shortest, step) == pytest.approx(round(math.log(said / shortest, step)))
 
 
-class Remembering:
-    """An axis with backlash that keeps its whole history in one list, as slow as it is plain."""
-
-    def __init__(self, speed, acceleration, backlash):
-        self.limits, self.half, self.segments = (speed, acceleration), backlash / 2, [(-math.inf, 0.0, 0.0, 0.0)]
-
-    def command(self, t, goal):
-        x, v = self.motor(t)
-        kept = [segment for segment in self.segments if segment[0] < t]
-        self.segments = kept + trapezoid(t, x, v, goal, *self.limits)
-
-    def motor(self, t):
-        start, x, v, a = self.segments[bisect_right(self.segments, t, key=lambda segment: segment[0]) - 1]
-        dt = t - start if v or a else 0.0
-        return x + v * dt + a * dt * dt / 2, v + a * dt
-
-    def driven(self, t):
-        """Let the driven side be pulled along at every turn and at the end of every segment."""
-        y = 0.0
-        for i, (start, _, v, a) in enumerate(self.segments):
-            end = min(t, self.segments[i + 1][0] if i + 1 < len(self.segments) else t)
-            for when in (start - v / a if a else math.nan, end):
-                if start < when <= end:
-                    x = self.motor(when)[0]
-                    y = min(max(y, x - self.half), x + self.half)
-        return y
-
-
 @pytest.mark.parametrize("limits", [(1.0, 10.0), (1.0, math.inf)])
-def test_an_axis_that_forgets_stands_where_one_that_remembers_stands(limits):
+def test_an_axis_that_forgets_stands_where_one_that_remembers_stands(limits, monkeypatch):
     """Bit by bit, where play hangs on all of the way that it came, and motions are replaced before they begin."""
-    rng = np.random.default_rng(1)
-    axis, whole = Axis(*limits, backlash=0.05), Remembering(*limits, 0.05)
-    t = 0.0
-    for _ in range(200):
-        t += rng.choice([0.01, 0.04, 2.0])
-        goal = rng.uniform(-0.2, 0.2)
-        for each in (axis, whole):
-            each.command(t + 0.04, goal)
-        for age in (0.0, 0.02, 0.5):
-            assert axis.motor(t - age) == whole.motor(t - age)
-            assert axis.driven(t - age) == whole.driven(t - age)
-    assert t > 2 * HISTORY_S
+
+    def positions():
+        rng, axis, t = np.random.default_rng(1), Axis(*limits, backlash=0.05), 0.0
+        for _ in range(200):
+            t += rng.choice([0.01, 0.04, 2.0])
+            axis.command(t + 0.04, rng.uniform(-0.2, 0.2))
+            for age in (0.0, 0.02, 0.5):
+                yield *axis.motor(t - age), axis.driven(t - age)
+        assert t > 2 * HISTORY_S
+        yield axis
+
+    *found, axis = positions()
     with pytest.raises(ValueError, match="the motion at 1 s is forgotten"):
         axis.driven(1.0)
+    monkeypatch.setattr(motion, "HISTORY_S", math.inf)
+    *whole, axis = positions()
+    assert found == whole
+    axis.driven(1.0)
 
 
 def test_the_memory_of_an_axis_does_not_grow_with_its_age():

@@ -5,7 +5,6 @@ import math
 import cv2
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
 
 from cotarget.board import board_points
 from cotarget.calibration.corners import find_corners
@@ -18,9 +17,6 @@ from cotarget.sim.zoom_lens import optics_at
 BOARD = BoardConfig(square=0.04)
 PROJECTION_PX = 0.1  # as for the shortest focal length: a board's mean offset
 ONE_CORNER_PX = 0.5  # noise, JPEG and the finder on a single corner
-STOPS = 8  # calibrated focal lengths, evenly spaced in the logarithm
-FOCAL_FOUND, CENTER_FOUND_PX, IMAGE_FOUND_PX = 1e-3, 0.3, 0.3  # what a spline through the stops has to reach
-NOT_A_CUBIC = 3.0  # a cubic misses by at least so many times of these
 EXACT = 1e-12
 ROUNDING_PX = 1e-9
 LONGEST = 12.0  # 72 / 6 mm
@@ -71,32 +67,6 @@ def test_without_drift_the_image_keeps_its_distortion():
         points = tangents / [magnification, magnification, 1.0]
         seen.append(cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(optics.distortion))[0])
     np.testing.assert_allclose(*seen, atol=1e-9)
-
-
-@pytest.mark.parametrize("ends", ["not-a-knot", "natural"])
-def test_eight_stops_are_enough_for_a_spline_and_a_cubic_is_not(ends):
-    camera = SimZoomCamera()
-    s, stops = np.linspace(0, 1, 401), np.linspace(0, 1, STOPS)
-
-    def curves(where):
-        """Focal length over nominal, centre [px], and what kappa1 moves the image's corner by [px]."""
-        found = [optics_at(camera, LONGEST**x) for x in where]
-        ratio = np.array([o.focal_px[0] for o in found]) / 692 / LONGEST**where
-        kappa1 = np.array([o.distortion[0] for o in found]) / (ratio * LONGEST**where) ** 2
-        corner = math.hypot(320, 240)
-        return np.column_stack([ratio, [o.center_px for o in found], kappa1 * corner * (corner / 692) ** 2])
-
-    limits = np.array([FOCAL_FOUND, CENTER_FOUND_PX, CENTER_FOUND_PX, IMAGE_FOUND_PX])
-    true = curves(s)
-    spline = CubicSpline(stops, curves(stops), bc_type=ends)(s)
-    missed = np.abs(spline - true).max(axis=0)
-    print(f"{ends}: focal {missed[0]:.2e}, centre {missed[1]:.3f} {missed[2]:.3f} px, corner {missed[3]:.3f} px")
-    assert (missed < limits).all()
-    basis = np.vander(s, 4)
-    cubic = basis @ np.linalg.lstsq(basis, true, rcond=None)[0]
-    assert (np.abs(cubic - true).max(axis=0)[:3] > NOT_A_CUBIC * limits[:3]).all()
-    assert np.ptp(true[:, 0]) > 0.04
-    assert np.hypot(*(true[:, 1:3] - true[0, 1:3]).T).max() > 8
 
 
 def matrix(T):

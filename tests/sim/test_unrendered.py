@@ -40,14 +40,6 @@ def test_times_head_lens_and_truth_do_not_depend_on_rendering():
         assert not frame.image.flags.writeable
 
 
-@pytest.mark.slow
-@pytest.mark.render
-def test_one_camera_alone():
-    _, fixed, zoom = drive(SimWorld(config(), rendered=("fixed",)))
-    assert fixed.image.std() > 10
-    assert not zoom.image.any()
-
-
 def test_no_opengl_is_opened_for_no_picture(monkeypatch):
     def refuse(*_):
         raise AssertionError("nothing is to be rendered")

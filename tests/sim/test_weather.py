@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import SimEffects, parse_config
+from cotarget.config import parse_config
 from cotarget.sim.world import SimWorld
 
 pytestmark = pytest.mark.render
@@ -92,11 +92,6 @@ def test_foliage_stands_where_it_is_though_only_the_target_was_asked_for_before(
         np.testing.assert_array_equal(places[-1], plain.set_state(t).geom_xpos)
     crowns = [g for g in range(asked.model.ngeom) if asked.model.geom(g).name.startswith("clutter/crown_")]
     assert np.abs(places[1] - places[0])[crowns].max() > 1e-3
-
-
-def test_it_is_off_by_default():
-    """The figures of calibration and demo are for a world at rest."""
-    assert not SimEffects().clutter
 
 
 def test_crowns_of_a_users_scene_sway(tmp_path):

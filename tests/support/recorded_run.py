@@ -13,8 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cotarget.calibration import Calibration, load_calibration
-from cotarget.calibration.file import save_calibration
+from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS, RigConfig
 from cotarget.detection import Detection
@@ -167,7 +166,7 @@ def calibration():
 
 def calibration_file(folder: Path) -> Path:
     path = folder / "rig_calibration.json"
-    save_calibration(path, calibration())
+    calibration().save(path)
     return path
 
 
@@ -181,14 +180,14 @@ def run(rig, calibration, seconds=2.0, settings=SETTINGS, selector=None):
 def record(folder: Path, calibration: Path, rig=None, **options):
     """Record a run; its steps."""
     with Recorder(folder, CONFIG, calibration, "bird") as recorder:
-        return list(run(recorder.wrap(rig_of(rig or ToyDevices())), load_calibration(calibration), **options))
+        return list(run(recorder.wrap(rig_of(rig or ToyDevices())), Calibration.load(calibration), **options))
 
 
 def main():
     folder = Path(sys.argv[1])
     path = calibration_file(folder)
     with Recorder(folder / "recording", CONFIG, path, "bird") as recorder:
-        for index, _ in zip(itertools.count(), run(recorder.wrap(toy_rig()), load_calibration(path), math.inf)):
+        for index, _ in zip(itertools.count(), run(recorder.wrap(toy_rig()), Calibration.load(path), math.inf)):
             while recorder.waiting:  # this rig is faster than any real one, and than the disk
                 time.sleep(0.001)
             print(index, flush=True)
