@@ -246,6 +246,7 @@ def test_usual_reasons_cause_no_warning(runs):
 @pytest.mark.parametrize(("runs", "said"), [
     ([(83, "", True), (60, "needs pan 3", True), (7, "needs pan 9.5", True)], "67 of 150 frames: needs pan 9.5"),
     ([(90, "a is 1; b", True), (10, "b", True)], "100 of 100 frames: b; 90 of 100 frames: a is 1"),
+    ([(50, "", True), (FEW, "both views make it 0.1 m", True)], f"{FEW} of 55 frames: both views make it 0.1 m"),
     ([(10, "", True), (40, "out of sight for 2 s", True)], "40 of 50 frames: out of sight for 2 s"),
     ([(10, "says\n1 thing", True)], "10 of 10 frames: says 1 thing"),
 ])  # fmt: skip
