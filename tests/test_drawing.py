@@ -9,10 +9,14 @@ from cotarget import drawing
 from cotarget.drawing import (
     SIZE_KNOWN_S,
     TargetStages,
+    aim_error_figure,
+    captioned,
     draw_box,
     draw_frames,
     side_by_side,
+    write_text,
 )
+from cotarget.metrics import Row
 from cotarget.rig import Frame
 from tests.support.steps import PICTURE, step
 
@@ -35,6 +39,20 @@ def test_centred_is_the_step_with_the_shortest_lens_of_those_near_the_middle():
     course = [(700, 12), (900, 5), (1200, 2), (1500, 0), (2000, -4), (2500, 0)]
     steps = [step(0.04 * i, focal_px=focal, off_px=off) for i, (focal, off) in enumerate(course)]
     assert staged(steps).centred is steps[2]
+
+
+def test_a_step_whose_zoom_frame_does_not_show_the_target_is_not_centred():
+    unseen = [step(0.0, seen_s=0.04), dataclasses.replace(step(0.04), found=None)]
+    assert staged(unseen).centred is None
+    steps = [*unseen, step(0.08)]
+    assert staged(steps).centred is steps[2]
+
+
+def test_centred_comes_before_the_close_up():
+    steps = [step(0.0), step(SIZE_KNOWN_S + 0.1), step(SIZE_KNOWN_S + 0.2, focal_px=2900.0)]
+    stages = staged(steps)
+    assert stages.close is steps[1]
+    assert stages.centred is steps[0]
 
 
 def test_the_picture_of_a_target_enlarges_the_fixed_frame_as_much_as_the_close_up():
@@ -76,6 +94,34 @@ def test_a_box_is_visible_on_any_background_and_does_not_cover_its_target(grey, 
     assert changed[: v - 12 * width // 640].max() >= VISIBLE  # its label
 
 
+@pytest.mark.parametrize("at", [(0.0, 0.0), (639.0, 479.0), (639.0, 0.0)])
+def test_the_label_of_a_box_at_the_border_is_in_the_image(at):
+    """Its number takes as many pixels as in the middle of the image."""
+    shown = []
+    for place in (np.array([320.0, 240.0]), np.array(at)):
+        with_label, without = (np.zeros((480, 640, 3), np.uint8) for _ in range(2))
+        draw_box(with_label, place, BIRD_PX, (0, 200, 255), "42")
+        draw_box(without, place, BIRD_PX, (0, 200, 255), "")
+        shown.append(int((with_label != without).any(axis=2).sum()))
+    assert shown[1] == pytest.approx(shown[0], rel=0.1)
+
+
+@pytest.mark.parametrize("grey", [0, 60, 128, 200, 255])
+def test_a_text_can_be_read_on_any_background(grey):
+    image = np.full((60, 200, 3), grey, np.uint8)
+    write_text(image, "bird", (10, 40))
+    assert np.abs(image.astype(int) - grey).max() >= VISIBLE
+
+
+@pytest.mark.parametrize("width", [320, 640, 1920])
+def test_a_caption_fits_below_its_image(width):
+    text = "close-up   pan -123.45   tilt -12.34 deg   focal length 12345 px   and more than was ever there"
+    image = captioned(np.zeros((240, width, 3), np.uint8), text)
+    strip = image[240:].min(axis=2)
+    assert (strip[:, -5:] > 200).all()
+    assert (strip < 100).any()
+
+
 @pytest.mark.parametrize(
     ("fixed", "zoom"), [((320, 240), (320, 240)), ((640, 480), (320, 240)), ((320, 240), (800, 600))]
 )
@@ -108,3 +154,20 @@ def test_a_film_shows_the_reason_at_the_bottom_of_the_fixed_cameras_image():
     assert 440 < short.min() < short.max() < 480
     assert long.min() < short.min() - 10
     assert long.max() < 480
+
+
+def row(t, focal_px):
+    """A frame with everything at its middle."""
+    numbers = {f.name: 0.0 if f.type is float else 0 for f in dataclasses.fields(Row)}
+    return Row(**numbers | {"t_s": t, "width_px": 64, "height_px": 48, "focal_px": focal_px, "wanted_px": 9.0})
+
+
+@pytest.mark.parametrize("names", [["book"], ["book", "person", "bird"]])
+def test_the_legend_of_the_aim_error_lies_on_no_curve(names):
+    figure = aim_error_figure({name: [row(0.1 * i, 700.0 + 90 * i) for i in range(9)] for name in names})
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert len(figure.axes) == 2 * len(names)
+    for ax in figure.axes:
+        assert ax.get_legend() is None
+        assert not legend.get_window_extent().overlaps(ax.get_window_extent())

@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -83,6 +84,14 @@ def test_table_on_a_filling_disk_keeps_its_complete_lines(tmp_path):
         write_table(path, 9, keep=True)
     assert str(path) in caught.value.__notes__[0]
     assert path.read_text().split() == ["n", "0", "1", "2"]
+
+
+def test_film_without_room_for_its_header_is_removed(tmp_path):
+    path = tmp_path / "a.mp4"
+    with full_disk(1000), pytest.raises(KeyboardInterrupt) as caught:
+        write_film(path, 3, KeyboardInterrupt(), keep=True)
+    assert str(path) in caught.value.__notes__[0]
+    assert names(tmp_path) == []
 
 
 def noisy_film(path, seconds):
@@ -167,6 +176,48 @@ def test_wait_for_another_run_ends_in_an_error(tmp_path, monkeypatch):
     with CsvFile(tmp_path / "a.csv", ("n",)), pytest.raises(ConfigError, match="is being written by another run"):
         write_atomically(tmp_path / "a.csv", b"whole")
     assert (tmp_path / "a.csv").read_text().split() == ["n"]
+
+
+class Signalled:
+    """A film's container; its process gets a signal while the film is completed."""
+
+    def __init__(self, container):
+        self.container, self.number = container, None
+
+    def __getattr__(self, name):
+        return getattr(self.container, name)
+
+    def mux(self, packets):
+        if self.number is not None:
+            signal.raise_signal(self.number)
+        self.container.mux(packets)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_second_signal_while_a_film_is_completed_loses_nothing(tmp_path, monkeypatch, number):
+    """The first one has ended the run; the second one is ignored while the file is completed."""
+    containers, plain = [], av.open
+    monkeypatch.setattr(av, "open", lambda *a, **k: containers.append(Signalled(plain(*a, **k))) or containers[-1])
+
+    def leave(*_):
+        raise KeyboardInterrupt("second")
+
+    def write_and_end():
+        with FilmWriter(tmp_path / "a.mp4", 25.0, keep=True) as film:
+            for index in range(3):
+                film.write(IMAGE, index / 25)
+            containers[0].number = number
+            raise KeyboardInterrupt("first")
+
+    former = signal.signal(number, leave)
+    try:
+        with pytest.raises(KeyboardInterrupt, match="first") as caught:
+            write_and_end()
+        assert signal.getsignal(number) is leave
+    finally:
+        signal.signal(number, former)
+    assert str(tmp_path / "a.mp4") in caught.value.__notes__[0]
+    assert len(times_in(tmp_path / "a.mp4")) == 3
 
 
 @pytest.fixture
