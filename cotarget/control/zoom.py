@@ -12,16 +12,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from cotarget.estimation.measurement_model import Appearance, Estimate
 from cotarget.geometry import Array
+from cotarget.metrics import GOOD_SIZE
 from cotarget.tracking.track import Track
 
-# Bisections of the range of focal lengths, tenfold or so, to a thousandth.
-HALVINGS = 12
-# A target is seen well if it is wholly in the image with this probability, at a size ratio in this range; the range is
-# that of a good close-up in `cotarget.metrics`.
-SEEN_WELL, GOOD_SIZE = 0.8, (0.8, 1.25)
+# Probability that the whole target is in the image: below it the lens zooms out, from it on the target is seen well.
+LIKELY = 0.8
 
 
 @dataclass(frozen=True)
@@ -29,15 +28,14 @@ class ZoomSettings:
     """Settings of the zoom controller.
 
     Attributes:
-        sure: probability that the whole target is in the image up to which the lens zooms in.
-        unsure: probability below which it zooms out; between the two it stays.
+        sure: probability that the whole target is in the image up to which the lens zooms in; it zooms out below
+            `LIKELY`, and stays between the two.
         rim_px: margin at the image's border that the target must not enter [px].
         deadband: relative change of the focal length below which the lens is not commanded.
         settle_s: time after a forced zoom out in which the lens does not zoom in [s].
     """
 
     sure: float = 0.95
-    unsure: float = 0.8
     rim_px: float = 4.0
     deadband: float = 0.06
     settle_s: float = 0.3
@@ -130,7 +128,7 @@ def is_seen_well(
     wanted_px = min(estimate.target.wanted_px, seen.size_px * zoom.at(longest_px).focal_px[0] / focal)
     if not GOOD_SIZE[0] * wanted_px <= seen.size_px <= GOOD_SIZE[1] * wanted_px:
         return False
-    return chance_inside(_expected(estimate, seen, shape), focal, zoom.size) >= SEEN_WELL
+    return chance_inside(_expected(estimate, seen, shape), focal, zoom.size) >= LIKELY
 
 
 def chance_inside(expected: ExpectedTarget, focal_px: float, size: tuple[int, int], rim_px: float = 0.0) -> float:
@@ -169,16 +167,14 @@ def longest_focal(
         focal_range: shortest and longest focal length [px]; the shortest is returned even if it does not suffice.
         rim_px: margin at the border that does not count as image [px].
     """
-    low, high = focal_range
-    if chance_inside(expected, high, size, rim_px) >= chance:
-        return high
-    for _ in range(HALVINGS):
-        middle = math.sqrt(low * high)
-        if chance_inside(expected, middle, size, rim_px) >= chance:
-            low = middle
-        else:
-            high = middle
-    return low
+
+    def excess(focal_px: float) -> float:
+        return chance_inside(expected, focal_px, size, rim_px) - chance
+
+    shortest, longest = focal_range
+    if excess(longest) >= 0:
+        return longest
+    return shortest if excess(shortest) <= 0 else float(brentq(excess, shortest, longest))
 
 
 class ZoomController:
@@ -219,16 +215,13 @@ class ZoomController:
         if expected is None:
             self._out_t = t
             return ZoomChoice(self._range[0], 0.0, "lost")
-        settings = self._settings
+        settings, size = self._settings, self._size
         wanted = min(max(wanted_px, self._range[0]), self._range[1])
 
-        def longest(chance: float) -> float:
-            return longest_focal(expected, chance, self._size, self._range, settings.rim_px)
-
         def choice(focal_px: float, reason: str) -> ZoomChoice:
-            return ZoomChoice(focal_px, chance_inside(expected, focal_px, self._size, settings.rim_px), reason)
+            return ZoomChoice(focal_px, chance_inside(expected, focal_px, size, settings.rim_px), reason)
 
-        sure = longest(settings.sure)
+        sure = longest_focal(expected, settings.sure, size, self._range, settings.rim_px)
         goal = min(wanted, sure)
         reason = "wanted" if wanted <= sure else "unsure"
         change = math.log(goal / commanded_px)
@@ -238,7 +231,7 @@ class ZoomController:
                 here = commanded_px if now_px is None else now_px
                 return choice(max(commanded_px, min(goal, here)), "settling")
             return choice(goal, reason)
-        if commanded_px > longest(settings.unsure) and change < 0:
+        if change < 0 and commanded_px > longest_focal(expected, LIKELY, size, self._range, settings.rim_px):
             self._out_t = t
             return choice(goal, "about to be lost")
         if math.log(wanted / commanded_px) < -settings.deadband:
