@@ -33,8 +33,8 @@ class HeadSettings:
         catch_s: time in which an error of the head is corrected; shorter follows closer, longer is steadier [s].
         far: error in deadbands from which the head hurries, because it is no noise any more.
         hurry_s: time in which a far error is corrected [s].
-        still: speed of the target, in deadbands a second, below which it counts as standing.
-        slow: speed along one axis, in deadbands a second, below which the target stands along that axis.
+        slow: speed along one axis, in deadbands a second, below which the target stands along that axis; below half of
+            it along both together, the target stands.
         back_s: an axis that brings the target back into the deadband within this time is left alone [s].
         rest_s: least time after the last command before a standing target in the deadband is centred again [s].
         frames_ahead: least lead of a goal in frames, so that the head does not stop between frames of a slow camera.
@@ -46,8 +46,6 @@ class HeadSettings:
             head nods with the noise of the speed, without any it lags behind a target that moves slightly aslant.
         steps_off: a report agrees with the model of the head within this many steps ...
         time_off_s: ... plus the angle that the axis turns in this time [s].
-        reports_s: longest time between two reports from which the speed is computed, after the head contradicts the
-            model [s].
     """
 
     zone: float = 0.007
@@ -56,7 +54,6 @@ class HeadSettings:
     catch_s: float = 0.15
     far: float = 13.0
     hurry_s: float = 0.1
-    still: float = 10.5
     slow: float = 21.0
     back_s: float = 0.16
     rest_s: float = 1.0
@@ -67,7 +64,6 @@ class HeadSettings:
     slow_lead: float = 0.5
     steps_off: float = 2.0
     time_off_s: float = 0.01
-    reports_s: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -153,9 +149,9 @@ class HeadModel:
                 self._plans.append(replace(plan, motion=self.at(plan.t)))
 
     def _speeds(self, state: PanTiltState) -> Angles:
-        """Speeds of both axes from the last two reports [rad/s]; 0 if they are too far apart."""
+        """Speeds of both axes from the last two reports [rad/s]."""
         last, fastest = self._last, self._limits.speed
-        if last is None or not state.moving or not 0 < state.t - last.t <= self._settings.reports_s:
+        if last is None or not state.moving or state.t <= last.t:
             return 0.0, 0.0
         pan, tilt = (
             min(max((b - a) / (state.t - last.t), -fastest), fastest)
@@ -302,7 +298,7 @@ class HeadController:
         """Remove speed and lead from slow axes, where they are mostly noise."""
         limit = self._settings.slow * zone
         slow = tuple(abs(rate) * scale <= limit for rate, scale in zip(rates, _scales(wanted[1]), strict=True))
-        still = _angle_between(rates, (0.0, 0.0), wanted[1]) <= self._settings.still * zone
+        still = _angle_between(rates, (0.0, 0.0), wanted[1]) <= limit / 2
         back_s = lead_s if still else self._settings.slow_lead * lead_s
         pan, tilt = (q - back_s * rate if at_rest else q for q, rate, at_rest in zip(wanted, rates, slow, strict=True))
         pan_rate, tilt_rate = (0.0 if at_rest else rate for rate, at_rest in zip(rates, slow, strict=True))
@@ -331,15 +327,14 @@ class HeadController:
         They do if the target stays in the deadband, or if the axis is on its way there already. A new command in every
         frame would follow every error of the estimate.
         """
-        settings = self._settings
-        times = (0.0, interval_s, settings.back_s)
+        times = (0.0, interval_s, self._settings.back_s)
         now, then, back = (
             [abs(q - x) for q, x in zip(reference.after(s), self._at(effect_t + s), strict=True)] for s in times
         )
         resting = []
         for i, scale in enumerate(_scales(reference.wanted[1])):
             most = zone / scale
-            returns = then[i] < now[i] and back[i] <= max(most, settings.nearer * now[i])
+            returns = then[i] < now[i] and back[i] <= max(most, self._settings.nearer * now[i])
             resting.append(then[i] <= most or returns)
         return resting
 
