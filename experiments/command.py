@@ -23,6 +23,8 @@ from cotarget.errors import ConfigError, CotargetError, choices
 from cotarget.plugins import is_own
 from cotarget.schema import validate
 from experiments.engine import (
+    FOLDERS,
+    ROOT,
     Case,
     Done,
     Job,
@@ -143,6 +145,9 @@ def _cases(
 def _checked(name: str, known: Known) -> str:
     if name in known:
         return name
+    for file in (f"{folder}/{name}.py" for folder in FOLDERS):
+        if (ROOT / file).is_file():
+            raise ConfigError(f"{file}: is no experiment, because it sets no SETTINGS")
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
     raise ConfigError(f"unknown experiment '{name}', the nearest is '{near[0]}'; there are: {choices(known)}")
 

@@ -132,10 +132,18 @@ Known = Mapping[str, Callable[[], Experiment]]
 
 
 def experiment_of(module: ModuleType) -> Experiment:
-    """Make an experiment of a module."""
+    """Make an experiment of a module.
+
+    Raises:
+        TypeError: SETTINGS are no settings, or there is no `one`.
+    """
     from experiments.tables import spread_columns
 
     found = vars(module)
+    if not isinstance(found["SETTINGS"], Settings):
+        raise TypeError(f"SETTINGS are of a subclass of Settings, not {found['SETTINGS']!r}")
+    if "one" not in found:
+        raise TypeError("it has no function one(settings, seed)")
     parts = {name: found[name] for name in FUNCTIONS if name in found}
     parts |= {name.lower(): found[name] for name in CONSTANTS if name in found}
     parts.setdefault("quick", dataclasses.replace(parts["settings"], seeds=min(parts["settings"].seeds, 2)))
@@ -154,7 +162,17 @@ def known_experiments() -> Known:
 
 
 def _load(module: str) -> Experiment:
-    return experiment_of(importlib.import_module(module))
+    """Import an experiment.
+
+    Raises:
+        ConfigError: the module cannot be imported, or is no experiment.
+    """
+    file = f"{module.replace('.', '/')}.py"
+    try:
+        return experiment_of(importlib.import_module(module))
+    except Exception as error:
+        text = " ".join(str(error).split())
+        raise ConfigError(f"{file}: is no experiment: {type(error).__name__}: {text}") from error
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import fcntl
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -496,3 +497,22 @@ def test_a_setting_that_cannot_be_is_refused_by_name(change):
     key = change.partition("=")[0]
     with pytest.raises(ConfigError, match=key.partition(".")[2]):
         cases(key.partition(".")[0], changes=[change], known=known_experiments())
+
+
+@pytest.mark.parametrize(("text", "named"), [
+    ("def one(\nSETTINGS = 5", "SyntaxError: .*never closed"),
+    ("import nowhere\nSETTINGS = 5", "No module named 'nowhere'"),
+    ("SETTINGS = 5", "SETTINGS are of a subclass of Settings, not 5"),
+    ("from experiments.engine import Settings\nSETTINGS = Settings()", r"no function one\(settings, seed\)"),
+    ("one = 5", "it sets no SETTINGS"),
+])  # fmt: skip
+def test_a_file_that_is_no_experiment_is_named(tmp_path, monkeypatch, capsys, text, named):
+    folder = f"sketches_{abs(hash(text))}"  # a new package each time: imports are kept
+    for module in ("engine", "command"):
+        monkeypatch.setattr(f"experiments.{module}.ROOT", tmp_path)
+        monkeypatch.setattr(f"experiments.{module}.FOLDERS", (folder,))
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / folder).mkdir()
+    (tmp_path / folder / "rounding.py").write_text(text)
+    assert main(["rounding", "--out", str(tmp_path / "out")]) == 1
+    assert re.fullmatch(rf"python -m experiments: {folder}/rounding.py: .*{named}.*\n", capsys.readouterr().err)
