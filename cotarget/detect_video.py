@@ -176,10 +176,12 @@ def labelled_films(folder: Path, labels: Path) -> list[tuple[Path, Path]]:
     """Pair the films of a folder with the files of labels of the same name, by name.
 
     Raises:
-        ConfigError: there is no film, or a film has no labels.
+        ConfigError: there is no film, two have one name, or a film has no labels.
     """
-    pairs = []
+    pairs: list[tuple[Path, Path]] = []
     for film in sorted(each for each in folder.iterdir() if each.suffix.lower() in FILMS):
+        if pairs and pairs[-1][0].stem == film.stem:
+            raise ConfigError(f"{film}: has the name of {pairs[-1][0].name}; their tables would be one")
         files = [labels / f"{film.stem}{suffix}" for suffix in LABEL_FILES]
         found = next((file for file in files if file.is_file()), None)
         if found is None:

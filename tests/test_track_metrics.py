@@ -285,15 +285,21 @@ def test_the_command_scores_a_folder_of_films(folder, capsys):
 
 @pytest.mark.parametrize(("labels", "more", "named"), [
     ("tables", (), "one.mp4: has no labels; give"),
-    ("films/one.csv", (), "--labels: .* is a folder"),
+    ("films/one.csv", (), "--labels: .*one.csv is no folder"),
     ("films", ("--video", "drawn.mp4"), "--video: draws the tracks of one video"),
-    ("films", ("--csv", "none"), "--csv: .* existing folder"),
+    ("films", ("--csv", "none"), "--csv: none is no folder"),
 ])  # fmt: skip
 def test_a_folder_that_cannot_be_scored_is_refused(folder, capsys, labels, more, named):
     assert detect_folder(folder, *more, labels=labels) == 1
     out, err = capsys.readouterr()
     assert out == ""
     assert re.fullmatch(rf"cotarget detect: .*{named}.*\n", err)
+
+
+def test_two_films_of_one_name_are_refused(folder, capsys):
+    (folder / "films" / "one.avi").touch()
+    assert detect_folder(folder) == 1
+    assert "one.mp4: has the name of one.avi" in capsys.readouterr().err
 
 
 def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):
@@ -324,5 +330,7 @@ def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):
     out, err = capsys.readouterr()
     assert (json.loads(out)["on_target_ratio"], json.loads(out)["labels_beyond_end"]) == (1.0, 1)
     assert f"1 of {len(steps) + 1} labelled frames are beyond the last one, {len(steps) - 1}," in err
-    assert main([*arguments, str(tmp_path / "none.csv")]) == 1
-    assert "none.csv" in capsys.readouterr().err
+    beyond = write_labels(tmp_path / "beyond.csv", [f"{len(steps)},1,1,5,5"])
+    for refused, named in ((tmp_path / "none.csv", "none.csv"), (beyond, "no labelled frame is in the film")):
+        assert main([*arguments, str(refused)]) == 1
+        assert named in capsys.readouterr().err

@@ -188,11 +188,6 @@ def detect_command(options: argparse.Namespace) -> None:
     with progress_bar() as progress:
         found = run_on_film(options.film, target, options.csv, options.video, progress, keep=True)
     whole = found.shortfall is None
-    if labels and whole and min(labels) > found.last_frame:
-        raise ConfigError(
-            f"{options.labels}: no labelled frame is in the film, whose last one is {found.last_frame}; give the "
-            "labels of this film, with frames from 0"
-        )
     tracks = [] if labels is None else read_tracks(options.csv)
     frames = found.last_frame + 1
     scores = scores_of(options.labels, tracks, labels, found.rate_hz, frames, whole=whole, criterion=criterion)
@@ -205,13 +200,15 @@ def _detect_in_folder(options: argparse.Namespace, target: "TargetProfile", crit
     """Score the videos of a folder by the labels of another."""
     from cotarget.detect_video import labelled_films, run_on_folder
 
-    if options.labels is None or not options.labels.is_dir():
-        raise ConfigError(f"--labels: {options.film} is a folder; give the folder with a file of labels for each video")
     if options.video is not None:
         raise ConfigError("--video: draws the tracks of one video, not of a folder")
-    films = labelled_films(options.film, options.labels)
+    if options.labels is None:
+        raise ConfigError(f"--labels: missing; {options.film} is a folder, whose videos are scored by labels")
+    if not options.labels.is_dir():
+        raise ConfigError(f"--labels: {options.labels} is no folder; give one with a file of labels for each video")
     if options.csv == STDOUT or not options.csv.is_dir():
-        raise ConfigError(f"--csv: {options.film} is a folder; give an existing folder for the tables")
+        raise ConfigError(f"--csv: {options.csv} is no folder; give an existing one for the tables of the videos")
+    films = labelled_films(options.film, options.labels)
     tables = [options.csv / f"{film.stem}.csv" for film, _ in films]
     check_outputs([*tables, options.sheet], [path for pair in films for path in pair])
     with progress_bar() as progress:
