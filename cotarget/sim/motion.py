@@ -154,15 +154,13 @@ class Axis:
         half, segments, y = self._half, plan.segments, plan.driven
         if not half:
             return x
-        for i, (start, _, v, a) in enumerate(segments):
+        for i, (start, *_) in enumerate(segments):
             if start > t:
                 break
             end = min(t, segments[i + 1][0] if i + 1 < len(segments) else t)
-            turns = start - v / a if a else math.nan  # time at which the motor reverses within this segment
-            for when in (turns, end):
-                if start < when <= end:
-                    at = x if when == t else _at(segments, when)[0]
-                    y = min(max(y, at - half), at + half)
+            if start < end:  # the motor reverses at the end of a segment only
+                at = x if end == t else _at(segments, end)[0]
+                y = min(max(y, at - half), at + half)
         return y
 
 
