@@ -415,9 +415,8 @@ class Request(BaseHTTPRequestHandler):
             self.raw_requestline = self.rfile.readline(65537)
             if self.raw_requestline and self.parse_request():
                 self._answer(self._arguments())
-        except (HttpError, ValueError) as error:  # the latter for a target or a length that cannot be parsed
-            refusal = error if isinstance(error, HttpError) else HttpError(HTTPStatus.BAD_REQUEST)
-            self.connection.sendall(error_reply(refusal))
+        except HttpError as error:
+            self.connection.sendall(error_reply(error))
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """Refuse a request that cannot be parsed."""
@@ -426,8 +425,11 @@ class Request(BaseHTTPRequestHandler):
     def _arguments(self) -> dict[str, str]:
         """Parse the arguments of the target and of a form in the body; the last value of a name counts."""
         # The body is read even if it is not used: closing a socket with unread bytes may lose the reply.
-        body = self.rfile.read(int(self.headers.get("Content-Length", "0")))
-        pairs = parse_qsl(urlsplit(self.path).query, keep_blank_values=True)
+        try:
+            body = self.rfile.read(int(self.headers.get("Content-Length", "0")))
+            pairs = parse_qsl(urlsplit(self.path).query, keep_blank_values=True)
+        except ValueError:
+            raise HttpError(HTTPStatus.BAD_REQUEST) from None
         # The package axis on PyPI sends plain text, which real units accept.
         if self.headers.get_content_type() in ("application/x-www-form-urlencoded", "text/plain"):
             pairs += parse_qsl(body.decode("latin-1"), keep_blank_values=True)
