@@ -400,6 +400,22 @@ def test_bytes_without_pictures_do_not_go_on_for_ever(server, monkeypatch):
         camera.read(t, PATIENCE_S)
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_damaged_pictures_are_dropped_and_counted(server, whole, capfd):
+    """One ends in the middle of its data, with a last marker or without it."""
+    picture = jpeg(1)
+    damaged = picture[: (picture.index(b"\xff\xda") + len(picture)) // 2].rstrip(b"\xff") + b"\xff\xd9" * whole
+    with opened(server) as camera:
+        viewer = server.viewer()
+        t = camera.read().t
+        viewer.send(part(damaged) + b"--myboundary\r\n")
+        until(camera, t, "broken")
+        assert camera.counts.refused == 1
+        viewer.send(part(jpeg(2)))
+        assert camera.read(t, PATIENCE_S).t > t
+    assert capfd.readouterr() == ("", "")
+
+
 def test_closing_frees_a_reader_at_once_and_ends_the_thread(server):
     camera = AxisCamera(config(server), MonotonicClock())
     t, said = camera.read().t, queue.Queue()

@@ -161,6 +161,18 @@ def test_a_refused_move_is_halted_and_raises_in_its_wait_or_the_next_call(opened
     head.move(0.2, 0.2, wait=True)
 
 
+def test_a_newer_move_takes_the_place_of_one_that_waits(opened, link):
+    head = opened()
+
+    def newer():
+        link.stuck = False
+        head.move(5 * STEP, 0.0)
+
+    link.stuck, link.meanwhile = True, newer
+    with pytest.raises(HaltedError, match="another move took this one's place"):
+        head.move(STEP, 0.0, wait=True)
+
+
 @pytest.mark.parametrize("between", [True, False])
 def test_repeated_silence_without_a_position_ends_the_head(opened, link, between):
     head = opened()

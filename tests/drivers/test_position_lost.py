@@ -72,6 +72,13 @@ def test_a_marker_that_cannot_be_read_refuses_too(stop_file):
     assert "cotarget reset-head" in refused(lost)
 
 
+def test_the_stop_file_itself_is_no_lost_position(stop_file):
+    stop_file.parent.mkdir()
+    stop_file.touch()
+    stop_file.with_name("stop.old").touch()
+    assert not refused(PositionLostMarker(USB, stop_file))
+
+
 def test_a_marker_that_cannot_be_written_or_read_is_reported(tmp_path, caplog):
     (tmp_path / "file").touch()
     lost = PositionLostMarker(USB, tmp_path / "file" / "stop")
