@@ -40,6 +40,16 @@ def test_hand_eye_refuses_matrices():
         solve_hand_eye([np.eye(4)] * 3, [np.eye(4)] * 3)
 
 
+@pytest.mark.parametrize(("angles", "message"), [
+    ([(0.0, 0.1), (0.2, 0.1), (-0.3, 0.1)], "only pan moved"),
+    ([(0.1, 0.0), (0.1, 0.2), (0.1, -0.3)], "only tilt moved"),
+    ([(0.1, 0.1), (0.1, 0.1)], "did not move"),
+])  # fmt: skip
+def test_park_martin_refuses_motions_about_one_axis(angles, message):
+    with pytest.raises(CalibrationError, match=message):
+        park_martin(*exact_motions(pose([0.1, 0.0, 0.0], [1.0, 2.0, 3.0]), angles))
+
+
 HAND = pose([0.02, -0.08, 0.05], [0.7, -1.4, 0.5])
 ANGLES = [(0.0, 0.0), (0.3, 0.1), (-0.2, 0.3), (0.4, -0.3), (-0.4, -0.2)]
 

@@ -78,6 +78,24 @@ def hand_normal(angles):
 OF_HEAD = ("axis offset", "squareness")
 
 
+def test_limits_of_use_scale_with_the_focal_length():
+    """At 7000 px k1 hardly bends the image."""
+    boards = [
+        pose([x, y, z], [a, b, 0])
+        for x, y, z, a, b in (
+            (0.3, 0.1, 20, 30, 0),
+            (-0.3, 0.2, 25, 0, 30),
+            (0.2, -0.1, 15, -30, 20),
+            (0, 0, 18, 20, -30),
+        )
+    ]
+    normal = lens_normal(boards, 7000.0)
+    assert "distortion" in name_directions(LENS_NAMES, weak_directions(normal, LENS_NAMES, SIGMA_PX**2))
+    focal_px = {"fixed": 7000.0}
+    weak = weak_directions(normal, LENS_NAMES, SIGMA_PX**2, focal_px)
+    assert "distortion" not in name_directions(LENS_NAMES, weak, focal_px)
+
+
 @pytest.mark.parametrize(("angles", "begins", "free"), [
     ([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.0)], "only pan moved",
      ("position along the pan axis", "rotation about the pan axis", *OF_HEAD, "add tilt")),
@@ -105,6 +123,13 @@ def test_single_undetermined_parameter_is_named_with_advice(name, free, add):
     text = name_directions(names, weak_directions(np.diag([1.0, 0.0]), names, 0.0))
     assert text.startswith(f"{free} is free; ")
     assert add in text
+
+
+@pytest.mark.parametrize(("sigma", "weak"), [(4.9, 0), (5.1, 1)])
+def test_limit_of_use_of_a_rotation_is_five_degrees(sigma, weak):
+    names = ["T_zoom0_fixed.ry"]
+    normal = np.array([[1.0]]) / np.radians(sigma) ** 2
+    assert len(weak_directions(normal, names, 1.0)) == weak
 
 
 def test_no_direction_has_no_name_and_unknown_parameters_are_refused():

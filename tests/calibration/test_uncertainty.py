@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from cotarget.calibration import Calibration, Covariance, line_of_sight_covariance, predicted_pointing
-from cotarget.calibration.bundle import ALL_BLOCKS, coordinate_variance, parameter_names
+from cotarget.calibration.bundle import ALL_BLOCKS, Fit, coordinate_variance, parameter_names
 from cotarget.calibration.initialization import at_home
+from cotarget.calibration.model import BundleModel
+from cotarget.calibration.uncertainty import covariance_of
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import Reach, aim, error_budget, point_at
 from experiments.calibration.honesty import error_of
-from experiments.calibration.synthetic.rig import Truth
+from experiments.calibration.synthetic.rig import SIZE, Truth
 from experiments.calibration.synthetic.views import synthetic_views
 from tests.support.rigs import with_zoom_head
 from tests.support.synthetic_calibration import POINTS, calibrated
@@ -137,6 +139,20 @@ def test_pointing_without_covariance_or_t_is_refused(views, calibration):
     assert pair_only.covariance.parameters == parameter_names(("fixed", "zoom", "gamma", "warp"))
     with pytest.raises(CalibrationError, match="no T_head_zoom"):
         predicted_pointing(pair_only, np.array([320.0, 240.0]), 8.0)
+
+
+def test_undetermined_fit_has_no_covariance():
+    lens = Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0))
+    model, off = BundleModel({0: RigidTransform.identity()}, FixedCamera(lens)), np.full((2, 20, 2), 0.1)
+
+    def found(normal, variance=0.01):
+        return covariance_of(Fit(model, ("fixed",), off, off, normal, variance, 0.0, ()))
+
+    assert found(np.eye(8)) is not None
+    assert found(np.ones((8, 8))) is None
+    assert found(np.zeros((8, 8))) is None
+    assert found(np.eye(8), None) is None
+    assert coordinate_variance(off[0, :7], 14) is None  # 14 coordinates, 14 parameters
 
 
 def test_the_variance_of_a_coordinate():
