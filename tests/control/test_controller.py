@@ -203,7 +203,7 @@ def test_the_less_is_known_the_wider_the_lens_stays():
     assert drive.zoom_reason == "unsure"
     assert drive.chance == pytest.approx(ZoomSettings().sure, abs=0.01)
     # Of the height alone, the narrower axis, 95 % are within 1.96 sigma; half the book comes on top.
-    half = SIZE[1] / 2 / (TRUE * rig.zooms[-1])
+    half = (SIZE[1] / 2 - ZoomSettings().rim_px) / (TRUE * rig.zooms[-1])
     assert 1.96 < (half - 0.5 * BOOK.size / 10) / 0.05 < 2.24
 
 

@@ -40,9 +40,9 @@ def test_the_longest_focal_length_has_the_chance_asked_for():
     seen = expected(0.01, (0.005, 0.0))
     found = longest_focal(seen, 0.95, SIZE, RANGE)
     assert chance_inside(seen, found, SIZE) == pytest.approx(0.95, rel=EXACT)
-    # By hand: certain and at rest in the middle, half the height over half the target's height.
+    # By hand: certain and at rest in the middle, half the height over half the target's height and rim.
     sure = expected(1e-9, half=(0.01, 0.05))
-    assert longest_focal(sure, 0.95, SIZE, RANGE) == pytest.approx(240.0 / 0.05, rel=EXACT)
+    assert longest_focal(sure, 0.95, SIZE, RANGE, rim_px=4.0) == pytest.approx(236.0 / 0.05, rel=EXACT)
     assert longest_focal(expected(1.0), 0.95, SIZE, RANGE) == RANGE[0]
     assert longest_focal(expected(1e-9, half=(1e-4, 1e-4)), 0.95, SIZE, RANGE) == RANGE[1]
 

@@ -338,6 +338,16 @@ def test_the_zoom_image_is_not_searched_without_a_target_and_a_pose():
     assert fusion.update_zoom(Frame(IMAGE, 0.0), 0.0) is not None
 
 
+def test_another_target_has_another_finder():
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion.follow(1)
+    finder = fusion.search.finder
+    fusion.follow(1)
+    assert fusion.search.finder is finder
+    fusion.follow(2)
+    assert fusion.search.finder is not finder
+
+
 def test_the_finder_measures_the_centre_of_the_followed_body():
     """A track's box may lie beside the body."""
 
