@@ -48,7 +48,8 @@ class Bound:
 
     def __str__(self) -> str:
         limits = self.bound if isinstance(self.bound, tuple) else (math.nan if self.bound is None else self.bound,)
-        return f"{self.name}: {self.reached}, {self.kind.replace('_', ' ')} {' to '.join(f'{v:.4g}' for v in limits)}"
+        reached = "not among the figures" if self.reached is None else self.reached
+        return f"{self.name}: {reached}, {self.kind.replace('_', ' ')} {' to '.join(f'{v:.4g}' for v in limits)}"
 
     @property
     def kept(self) -> bool:
