@@ -153,10 +153,6 @@ def scores_of(
 
     if labels is None:
         return {}
-    if whole and labels and min(labels) >= frames:
-        raise ConfigError(
-            f"{file}: no labelled frame is in the film, whose last one is {frames - 1}; give the labels of this film"
-        )
     score = score_tracks(tracks, labels, rate_hz, frames, criterion=criterion or Criterion())
     if score.labels_beyond_end:
         print(

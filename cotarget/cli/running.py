@@ -188,6 +188,11 @@ def detect_command(options: argparse.Namespace) -> None:
     with progress_bar() as progress:
         found = run_on_film(options.film, target, options.csv, options.video, progress, keep=True)
     whole = found.shortfall is None
+    if labels and whole and min(labels) > found.last_frame:
+        raise ConfigError(
+            f"{options.labels}: no labelled frame is in the film, whose last one is {found.last_frame}; give the "
+            "labels of this film, with frames from 0"
+        )
     tracks = [] if labels is None else read_tracks(options.csv)
     frames = found.last_frame + 1
     scores = scores_of(options.labels, tracks, labels, found.rate_hz, frames, whole=whole, criterion=criterion)
