@@ -248,14 +248,21 @@ def _level(patch: Image) -> float:
 INNER_PX = 3
 # Inner and outer side of the ring, in pixels of an image of half the size: 14 and 22 px. The target lies inside.
 GUARD_HALF_PX, OUTER_HALF_PX = 7, 11
-# Scales, for targets of up to 12 px to those of up to 100: those of 60 need the ring of the last scale.
-SCALES = 4
+# Scales, for targets of up to 12 px to those of up to 400.
+SCALES = 6
 # First scale whose ring, 90 px, is so large that a sky's gradient counts.
 SLOPING_SCALE = 2
 # Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
 LEAST_ROUGHNESS = 1.5
 # Part of the contrast at which a target's outline lies.
 OUTLINE = 0.33
+# From this scale on, wings and rotors that are fainter than the body belong to the target: what stands out by this
+# many standard deviations of the surroundings, brighter or darker, and by a least part of the contrast.
+LARGE_SCALE, FAINT, FAINTEST = 2, 3.0, 0.05
+# Outlines are found this many scales finer than the peak, which bounds the window's size.
+WINDOW_SCALES = 3
+# The lens' blur is as faint: it reaches this far around the body [px].
+BLUR_PX = 2.5
 
 
 @dataclass(frozen=True)
@@ -277,25 +284,26 @@ class SmallTarget:
     around: float
 
 
-def find_small_targets(grey: Image, threshold: float, most: int) -> list[SmallTarget]:
+def find_small_targets(grey: Image, threshold: float, most: int, *, faint: bool = True) -> list[SmallTarget]:
     """Find regions that stand out at any scale, without overlaps, the strongest first.
 
     Args:
         grey: image, (H, W).
         threshold: least contrast, in standard deviations of the surroundings.
         most: most regions returned, and most examined at each scale; bounds the computing time.
+        faint: whether faint parts of a large region belong to it.
     """
     found: list[SmallTarget] = []
-    level = grey
+    levels = [grey]
     for scale in range(SCALES):
+        level = levels[scale]
         if min(level.shape) < 2 * OUTER_HALF_PX:
             break
-        half = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        for u, v, signal, around in _peaks(level, half, scale >= SLOPING_SCALE, threshold, most):
-            target = _outline(grey, (u, v), scale, signal, around)
+        levels.append(cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        for u, v, signal, around in _peaks(level, levels[-1], scale >= SLOPING_SCALE, threshold, most):
+            target = _outline(levels, (u, v), scale, signal, around, faint)
             if target is not None:
                 found.append(target)
-        level = half
     found.sort(key=lambda target: -target.signal)
     kept: list[SmallTarget] = []
     for target in found:
@@ -373,32 +381,63 @@ def _first_moment(half: Image, side: int, axis: int) -> Array:
     return np.asarray(cv2.sepFilter2D(half, cv2.CV_32F, kernels[0], kernels[1]))
 
 
-def _outline(grey: Image, peak: tuple[int, int], scale: int, signal: float, around: float) -> SmallTarget | None:
-    """Find the box of a peak in the full image; None if its outline leaves the ring.
+def _outline(
+    levels: list[Image], peak: tuple[int, int], scale: int, signal: float, around: float, faint: bool
+) -> SmallTarget | None:
+    """Find the box of a peak, in the image of a finer scale; None if its outline leaves the ring.
 
     Args:
-        grey: image, (H, W).
+        levels: image, (H, W), and its halvings.
         peak: the peak in pixels of its scale (u, v).
         scale: number of halvings.
         signal: contrast in standard deviations of the surroundings.
         around: mean grey level of the surroundings.
+        faint: whether faint parts of a large region belong to it.
     """
-    factor = 2**scale
+    fine = max(0, scale - WINDOW_SCALES)
+    image, factor, unit = levels[fine], 2 ** (scale - fine), 2**fine
     u, v = factor * peak[0] + factor // 2, factor * peak[1] + factor // 2
     reach = factor * GUARD_HALF_PX
     left, top = max(0, u - reach), max(0, v - reach)
-    window = grey[top : v + reach + 1, left : u + reach + 1].astype(np.float32) - np.float32(around)
+    window = image[top : v + reach + 1, left : u + reach + 1].astype(np.float32) - np.float32(around)
     near = window[max(0, v - top - factor) : v - top + factor + 1, max(0, u - left - factor) : u - left + factor + 1]
-    contrast = float(near.flat[int(np.argmax(np.abs(near)))])
-    inside = (window > OUTLINE * contrast) if contrast > 0 else (window < OUTLINE * contrast)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8))
-    j, i = np.unravel_index(int(np.argmax(np.abs(near))), near.shape)
-    label = labels[max(0, v - top - factor) + int(j), max(0, u - left - factor) + int(i)]
-    x, y, w, h = stats[label][:4].tolist()
-    cut = (x == 0 and left > 0, y == 0 and top > 0, x + w == window.shape[1] and left + x + w < grey.shape[1])
-    if label == 0 or any(cut) or (y + h == window.shape[0] and top + y + h < grey.shape[0]):
+    j, i = (int(n) for n in np.unravel_index(int(np.argmax(np.abs(near))), near.shape))
+    contrast = float(near[j, i])
+    at = max(0, v - top - factor) + j, max(0, u - left - factor) + i
+    x, y, w, h = _component(window * np.sign(contrast) > OUTLINE * abs(contrast), at)
+    if faint and scale >= LARGE_SCALE:
+        part = min(OUTLINE, max(FAINT / signal, FAINTEST))
+        X, Y, W, H = _component(np.abs(window - _slope(window)) > part * abs(contrast), at)
+        if max(x - X, y - Y, X + W - x - w, Y + H - y - h) * unit > BLUR_PX + unit:
+            x, y, w, h = X, Y, W, H
+    bottom, right = window.shape
+    edges = (x == 0 and left > 0, y == 0 and top > 0)
+    if (
+        any(edges)
+        or (x + w == right and left + right < image.shape[1])
+        or (y + h == bottom and top + bottom < image.shape[0])
+    ):
         return None  # it goes on beyond its ring: a pole, or a target for the next scale
-    return SmallTarget((left + x, top + y), (w, h), contrast, signal, around)
+    return SmallTarget((unit * (left + x), unit * (top + y)), (unit * w, unit * h), contrast, signal, around)
+
+
+def _slope(window: Array) -> Array:
+    """Estimate the surroundings' slope from the window's border, zero in the middle, (h, w)."""
+    down, across = (
+        (float(np.median(last)) - float(np.median(first))) * np.linspace(-0.5, 0.5, n, dtype=np.float32)
+        for first, last, n in (
+            (window[0], window[-1], window.shape[0]),
+            (window[:, 0], window[:, -1], window.shape[1]),
+        )
+    )
+    return down[:, None] + across
+
+
+def _component(inside: Array, at: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Find the box of the connected component at a pixel (row, column): left, top, width and height."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8))
+    x, y, w, h = stats[labels[at]][:4].tolist()
+    return x, y, w, h
 
 
 def share(one: SmallTarget, other: SmallTarget) -> bool:
@@ -514,7 +553,7 @@ class SmallTargetDetector:
         cv2.accumulateWeighted(difference, self._usual, USUAL_GAIN)
         unusual = cv2.subtract(difference, nearby * np.float32(USUAL_TIMES), dtype=cv2.CV_8U)
         found = []
-        for target in find_small_targets(unusual, LEAST_DIFFERENCE, MOST_TARGETS):
+        for target in find_small_targets(unusual, LEAST_DIFFERENCE, MOST_TARGETS, faint=False):
             score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE)) if target.contrast > 0 else 0.0
             detection = box_detection(*target.low, *target.size, score, grey.shape)
             if detection.clipped:
