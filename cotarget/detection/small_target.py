@@ -421,7 +421,7 @@ def _outline(
     return SmallTarget((unit * (left + x), unit * (top + y)), (unit * w, unit * h), contrast, signal, around)
 
 
-def _slope(window: Array) -> Array:
+def _slope(window: np.ndarray) -> np.ndarray:
     """Estimate the surroundings' slope from the window's border, zero in the middle, (h, w)."""
     down, across = (
         (float(np.median(last)) - float(np.median(first))) * np.linspace(-0.5, 0.5, n, dtype=np.float32)
@@ -433,7 +433,7 @@ def _slope(window: Array) -> Array:
     return down[:, None] + across
 
 
-def _component(inside: Array, at: tuple[int, int]) -> tuple[int, int, int, int]:
+def _component(inside: np.ndarray, at: tuple[int, int]) -> tuple[int, int, int, int]:
     """Find the box of the connected component at a pixel (row, column): left, top, width and height."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8))
     x, y, w, h = stats[labels[at]][:4].tolist()
