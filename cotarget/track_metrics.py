@@ -171,7 +171,7 @@ class FrameMatch:
         pairs: label and track of each match.
         missed: labels that count and have no track.
         false: tracks that are on no label.
-        near: pairs of target and track that are near enough, one-to-one or not, for IDF1.
+        near: pairs of target and right or false track that are near enough, one-to-one or not, for IDF1.
     """
 
     frame: int
@@ -189,21 +189,23 @@ def match_frames(
     for each in tracks:
         by_frame.setdefault(each.frame, []).append(each)
     matches, before = [], dict[int, int]()
+    least = criterion.iou - np.finfo(float).eps
     for frame in sorted(labels):
         counted = [label for label in labels[frame] if label.counts]
         ignored = [label for label in labels[frame] if not label.counts]
         found = by_frame.get(frame, [])
         similar = criterion.similarity(counted, found)
-        enough = similar >= criterion.iou - np.finfo(float).eps
+        enough = similar >= least
         kept = np.array([[before.get(label.target) == each.track for each in found] for label in counted])
         value = np.where(enough, similar + KEPT * kept.reshape(similar.shape), 0.0)
         rows, columns = linear_sum_assignment(-value)
         pairs = [(counted[i], found[j]) for i, j in zip(rows, columns, strict=True) if enough[i, j]]
         before = {label.target: each.track for label, each in pairs}
         right, ids = {each.track for _, each in pairs}, {label.target for label, _ in pairs}
-        excused: list[bool] = np.any(criterion.similarity(ignored, found) >= criterion.iou, axis=0).tolist()
+        excused: list[bool] = np.any(criterion.similarity(ignored, found) >= least, axis=0).tolist()
         wrong = [each for each, excuse in zip(found, excused, strict=True) if each.track not in right and not excuse]
-        near = [(counted[i].target, found[j].track) for i, j in np.argwhere(enough)]
+        judged = right | {each.track for each in wrong}
+        near = [(counted[i].target, found[j].track) for i, j in np.argwhere(enough) if found[j].track in judged]
         missed = [label for label in counted if label.target not in ids]
         matches.append(FrameMatch(frame, pairs, missed, wrong, near))
     return matches
@@ -361,9 +363,9 @@ def pooled(scores: Sequence[TrackScore], minutes: float) -> dict[str, object]:
         minutes: duration of all films together [min].
 
     Returns:
-        `boxes`, `recall`, `precision`, `mota`, `idf1`, `id_switches`, `false_tracks`, `false_tracks_per_min`, `sizes`;
-        and over the targets of all films the median of `numbers` and of `first_track_s`, and the median and the least
-        `recall` over the films.
+        `films`, their number; `boxes`, `recall`, `precision`, `mota`, `idf1`, `id_switches`, `false_tracks`,
+        `false_tracks_per_min`, `sizes`; over the targets of all films the median of `numbers` and of `first_track_s`;
+        and the median and the least `recall` over the films.
     """
     boxes, found, false_boxes, switches, id_found, false = (
         sum(getattr(each, name) for each in scores)

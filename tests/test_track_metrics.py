@@ -156,6 +156,14 @@ def test_a_track_on_a_label_that_does_not_count_is_neither_right_nor_wrong():
     assert (score.boxes, score.found, score.false_boxes) == (0, 0, 1)
 
 
+def test_such_a_track_finds_no_identity_either():
+    """Track 1 is beside track 2 on a label that does not count, and takes over the target in the next frame."""
+    labels = boxes_of(Label, [(0, 1, 100), (1, 1, 100)])
+    labels[0] += boxes_of(Label, [(0, 2, 110)], counts=False)[0]
+    score = score_tracks(boxes_of(Tracked, [(0, 2, 100), (0, 1, 106), (1, 1, 100)]), labels, RATE, 2, 0)
+    assert (score.found, score.false_boxes, score.id_found, score.idf1) == (2, 0, 1, 0.5)
+
+
 def test_the_first_track_is_timed_from_the_first_label():
     labels, tracks = boxes_of(Label, [(i, 1, 100) for i in range(9)]), boxes_of(Tracked, [(i, 1, 100) for i in (5, 6)])
     assert score_tracks(tracks, labels, RATE, 9, 0).targets[1].first_track_s == pytest.approx(5 / RATE)
