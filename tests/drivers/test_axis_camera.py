@@ -273,6 +273,11 @@ def test_a_wrong_password_is_an_error_that_does_not_show_it(caplog):
             assert "hunter" not in said + caplog.text
 
 
+def test_a_password_that_the_server_repeats_is_masked(server):
+    server.pages[VIDEO] = reply(body=f"{PASSWORD} is wrong".encode())
+    assert "'*** is wrong'" in refused(server, user=USER, password=PASSWORD)
+
+
 def test_digest_comes_before_basic(server):
     server.pages[VIDEO] = reply("401 Unauthorized", b"who are you?", "text/html", BASIC, DIGEST)
     refused(server, LoginError, user=USER, password=PASSWORD)

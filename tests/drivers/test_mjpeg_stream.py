@@ -107,6 +107,12 @@ def test_a_broken_picture_is_dropped_and_counted_and_the_next_is_whole(name, ste
         assert reader.broken == 1
 
 
+def test_fill_bytes_may_precede_markers():
+    """T.81, B.1.1.2."""
+    filled = A[:2] + b"\xff\xff" + A[2:-2] + b"\xff" + A[-2:]
+    assert read(part(filled) + part(C))[0] == [filled, C]
+
+
 def test_a_picture_in_a_picture_is_not_taken_for_it():
     """Cameras put a thumbnail, a whole JPEG, into the application data; not even a broken picture gives it up."""
     thumbnail = jpeg(160, 120)
