@@ -286,7 +286,7 @@ def duration(text: str) -> float:
     return math.inf if text == "inf" else positive(text)
 
 
-def share(text: str) -> float:
+def ratio(text: str) -> float:
     """Parse a number above zero, up to one."""
     value = positive(text)
     if value > 1:

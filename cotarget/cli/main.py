@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cotarget.cli import calibrating, following, operating, running
-from cotarget.cli.common import board_corners, duration, length, number, port, positive, share, whole
+from cotarget.cli.common import board_corners, duration, length, number, port, positive, ratio, whole
 from cotarget.cli.following import add_selection
 from cotarget.errors import CotargetError
 
@@ -323,7 +323,7 @@ def _add_inspection(command: Command) -> None:
     _add_file(detect, "--labels", about)
     _add_file(detect, "--sheet", "write a picture of the longest misses and false tracks in a folder of videos", "PNG")
     about = "least intersection over union of a track on a label (0.3)"
-    detect.add_argument("--iou", type=share, default=0.3, metavar="R", help=about)
+    detect.add_argument("--iou", type=ratio, default=0.3, metavar="R", help=about)
     about = "judge boxes up to this side by the distance of their centres, at most the label's larger side (24)"
     detect.add_argument("--small-px", type=length, default=24.0, metavar="N", help=about)
 
