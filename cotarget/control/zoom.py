@@ -174,7 +174,7 @@ def longest_focal(
     shortest, longest = focal_range
     if excess(longest) >= 0:
         return longest
-    return shortest if excess(shortest) <= 0 else float(brentq(excess, shortest, longest))
+    return float(brentq(excess, shortest, longest)) if excess(shortest) > 0 else shortest
 
 
 class ZoomController:
