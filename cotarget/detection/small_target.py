@@ -259,6 +259,9 @@ OUTLINE = 0.33
 # From this scale on, wings and rotors that are fainter than the body belong to the target: what stands out by this
 # many standard deviations of the surroundings, brighter or darker, and by a least part of the contrast.
 LARGE_SCALE, FAINT, FAINTEST = 2, 3.0, 0.05
+# Window of the mean that a pixel is compared with for its texture [px]. Bright and dark parts of an aeroplane cancel in
+# the mean of a coarse scale; in the sky around it there is no texture.
+TEXTURE_PX = (5, 5)
 # Outlines are found this many scales finer than the peak, which bounds the window's size.
 WINDOW_SCALES = 3
 # The lens' blur is as faint: it reaches this far around the body [px].
@@ -291,16 +294,24 @@ def find_small_targets(grey: Image, threshold: float, most: int, *, faint: bool 
         grey: image, (H, W).
         threshold: least contrast, in standard deviations of the surroundings.
         most: most regions returned, and most examined at each scale; bounds the computing time.
-        faint: whether faint parts of a large region belong to it.
+        faint: whether faint parts of a large region belong to it, and its texture makes it stand out.
     """
     found: list[SmallTarget] = []
     levels = [grey]
+    texture: Image | None = None
     for scale in range(SCALES):
         level = levels[scale]
         if min(level.shape) < 2 * OUTER_HALF_PX:
             break
-        levels.append(cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-        for u, v, signal, around in _peaks(level, levels[-1], scale >= SLOPING_SCALE, threshold, most):
+        half = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        levels.append(half)
+        peaks = _peaks(level, half, scale >= SLOPING_SCALE, threshold, most)
+        if texture is not None:
+            texture = cv2.resize(texture, level.shape[::-1], interpolation=cv2.INTER_AREA)
+            peaks += _textured(texture, half, threshold, most)
+        elif faint and scale == LARGE_SCALE:
+            texture = cv2.absdiff(level, cv2.blur(level, TEXTURE_PX))
+        for u, v, signal, around in peaks:
             target = _outline(levels, (u, v), scale, signal, around, faint)
             if target is not None:
                 found.append(target)
@@ -338,6 +349,17 @@ def _peaks(
         peaks.append((u, v, abs(float(middle[v, u]) - around) / rough, around))
     peaks.sort(key=lambda peak: -peak[2])
     return peaks[:most]
+
+
+def _textured(texture: Image, half: Image, threshold: float, most: int) -> list[tuple[int, int, float, float]]:
+    """Find peaks of texture, as `_peaks` does, with the mean of the ring in the image of half the size."""
+    coarse = cv2.resize(texture, half.shape[::-1], interpolation=cv2.INTER_AREA)
+    peaks = _peaks(texture, coarse, False, threshold, most)
+    if not peaks:
+        return []
+    mean, _ = _ring(half, False)
+    height, width = mean.shape
+    return [(u, v, signal, float(mean[min(v // 2, height - 1), min(u // 2, width - 1)])) for u, v, signal, _ in peaks]
 
 
 def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
