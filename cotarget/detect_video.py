@@ -196,9 +196,9 @@ def run_on_folder(
     films: Sequence[tuple[Path, Path]],
     target: TargetProfile,
     tables: Path,
-    sheet: Path | None = None,
-    criterion: Criterion | None = None,
-    progress: Progress | None = None,
+    sheet: Path | None,
+    criterion: Criterion,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Detect and track a target in films and score the tracks.
 
@@ -207,7 +207,7 @@ def run_on_folder(
         target: target profile.
         tables: folder of the tables of tracks, one for each film.
         sheet: picture to write, with the longest misses (green) and false tracks (red); None for none.
-        criterion: when a track is on a label; its defaults by default.
+        criterion: when a track is on a label.
         progress: called before every film with (films done, films in all, what).
 
     Returns:
@@ -216,12 +216,10 @@ def run_on_folder(
     Raises:
         CotargetError: a film or its labels cannot be read, or a file cannot be written.
     """
-    criterion = criterion or Criterion()
     results, scores, tiles, minutes = {}, [], [], 0.0
     labels = [read_labels(file) for _, file in films]
     for i, ((film, _), boxes) in enumerate(zip(films, labels, strict=True)):
-        if progress is not None:
-            progress(i, len(films), film.stem)
+        progress(i, len(films), film.stem)
         table = tables / f"{film.stem}.csv"
         summary = run_on_film(film, target, table)
         tracks, frames = read_tracks(table), summary.last_frame + 1

@@ -185,9 +185,7 @@ def match_frames(
     tracks: Iterable[Tracked], labels: Mapping[int, Sequence[Label]], criterion: Criterion = Criterion()
 ) -> list[FrameMatch]:
     """Match tracks and labels one to one in every labelled frame, in the order of frames."""
-    by_frame: dict[int, list[Tracked]] = {}
-    for each in tracks:
-        by_frame.setdefault(each.frame, []).append(each)
+    by_frame = _by_frame(tracks)
     matches, before = [], dict[int, int]()
     least = criterion.iou - np.finfo(float).eps
     for frame in sorted(labels):
@@ -300,14 +298,18 @@ def _false_tracks(tracks: Sequence[Tracked], matches: Sequence[FrameMatch]) -> i
     """Count tracks that were off every label for half a second; frames without labels are a break for those once on."""
     on = {track.track for match in matches for _, track in match.pairs}
     off = {match.frame: {track.track for track in match.false} for match in matches}
-    by_frame: dict[int, list[Tracked]] = {}
-    for each in tracks:
-        by_frame.setdefault(each.frame, []).append(each)
-    never_on = (
+    return false_tracks(
         (found[0].t, off.get(frame, {each.track for each in found if each.track not in on}))
-        for frame, found in sorted(by_frame.items())
+        for frame, found in sorted(_by_frame(tracks).items())
     )
-    return false_tracks(never_on)
+
+
+def _by_frame(tracks: Iterable[Tracked]) -> dict[int, list[Tracked]]:
+    """Group tracks by their frame's number."""
+    found: dict[int, list[Tracked]] = {}
+    for each in tracks:
+        found.setdefault(each.frame, []).append(each)
+    return found
 
 
 def _gaps(matches: Sequence[FrameMatch], rate_hz: float) -> int:

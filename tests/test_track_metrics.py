@@ -289,6 +289,9 @@ def test_the_command_scores_a_folder_of_films(folder, capsys):
     assert sheet.shape == (200, 1200, 3)
     assert sheet[100, 300].max() < 60
     assert sheet[100, 100].min() > 140
+    # The square moves by 10 px of the tile a frame, so that the frame is the right one.
+    dark = np.argwhere(sheet[60:140, 250:350].max(axis=2) < 60)
+    assert np.median(dark[:, 1]) == pytest.approx(49.5, abs=5)
 
 
 @pytest.mark.parametrize(("labels", "more", "named"), [

@@ -149,7 +149,7 @@ class HeadModel:
                 self._plans.append(replace(plan, motion=self.at(plan.t)))
 
     def _speeds(self, state: PanTiltState) -> Angles:
-        """Speeds of both axes from the last two reports [rad/s]."""
+        """Speeds of both axes from the last two reports [rad/s]; 0 at rest, and after the first report."""
         last, fastest = self._last, self._limits.speed
         if last is None or not state.moving or state.t <= last.t:
             return 0.0, 0.0

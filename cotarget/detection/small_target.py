@@ -433,12 +433,9 @@ def _outline(
         if max(x - X, y - Y, X + W - x - w, Y + H - y - h) * unit > BLUR_PX + unit:
             x, y, w, h = X, Y, W, H
     bottom, right = window.shape
-    edges = (x == 0 and left > 0, y == 0 and top > 0)
-    if (
-        any(edges)
-        or (x + w == right and left + right < image.shape[1])
-        or (y + h == bottom and top + bottom < image.shape[0])
-    ):
+    across = (x == 0 and left > 0) or (x + w == right and left + right < image.shape[1])
+    down = (y == 0 and top > 0) or (y + h == bottom and top + bottom < image.shape[0])
+    if across or down:
         return None  # it goes on beyond its ring: a pole, or a target for the next scale
     return SmallTarget((unit * (left + x), unit * (top + y)), (unit * w, unit * h), contrast, signal, around)
 

@@ -176,10 +176,11 @@ class FakeWorld:
 @pytest.mark.wire
 def test_a_later_failure_of_the_world_is_raised_by_its_methods(monkeypatch):
     monkeypatch.setattr("cotarget.emulators.world.SimWorld", FakeWorld)
+    monkeypatch.setattr(FakeWorld, "closed", False)
     with LiveWorld(RigConfig()) as world:
         world.check()
         assert world.still().shape == (4, 4, 3)
-        FakeWorld.full = True
+        monkeypatch.setattr(FakeWorld, "full", True)
         for call in (world.check, world.still):
             assert fails(call) == "the simulated world failed: MemoryError('no more')"
     assert FakeWorld.closed
