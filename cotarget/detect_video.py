@@ -14,7 +14,7 @@ import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.detection import make_detector
-from cotarget.drawing import draw_box, write_picture
+from cotarget.drawing import draw_box, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
@@ -258,7 +258,7 @@ def contact_sheet(found: Sequence[tuple[Path, Mistake]]) -> Image:
 
 
 def _tile(image: Image, film: Path, mistake: Mistake) -> Image:
-    """Cut out a mistake, with its box, the film's name, the frame, and the length of the run."""
+    """Cut out a mistake, with its box, the film's name, the frame, and the number of frames of its run."""
     side = max(CUTOUT * mistake.box.larger_side_px, LEAST_CUTOUT_PX)
     scale = TILE_PX / side
     # Centres of pixels are whole numbers: the middle of the cutout is half a pixel before its middle column.
@@ -266,7 +266,6 @@ def _tile(image: Image, film: Path, mistake: Mistake) -> Image:
     tile = cv2.warpAffine(image, np.column_stack([scale * np.eye(2), shift]), (TILE_PX, TILE_PX))
     colour = MISSED if mistake.kind == "missed" else FALSE
     draw_box(tile, np.full(2, (TILE_PX - 1) / 2), scale * mistake.box.size_px, colour, "")
-    cv2.putText(tile, film.stem, (4, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.38, colour, 1, cv2.LINE_AA)
-    text = f"{mistake.kind} {mistake.frame}, {mistake.frames} frames"
-    cv2.putText(tile, text, (4, TILE_PX - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.38, colour, 1, cv2.LINE_AA)
+    write_text(tile, film.stem, (4, 16))
+    write_text(tile, f"{mistake.kind} {mistake.frame} ({mistake.frames})", (4, TILE_PX - 6))
     return np.asarray(tile, dtype=np.uint8)
