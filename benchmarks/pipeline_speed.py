@@ -21,7 +21,7 @@ from cotarget import backends
 from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetProfile
 from cotarget.control.selection import FirstCome
-from cotarget.detection import Detector, make_detector
+from cotarget.detection import AutoDetector, Detector, make_detector
 from cotarget.errors import ConfigError
 from cotarget.evaluation import true_calibration
 from cotarget.fusion import TargetFusion
@@ -39,7 +39,7 @@ MIXTURE = "MOG2 alone"
 # Lead of the aim [s].
 LEAD_S = 0.1
 STAGES = ("detect_ms", "track_ms", "aim_ms")
-WANTED = {"motion": 1.5, "speck": 2.5}  # goal: largest ratio to the subtraction alone
+WANTED = {"motion": 1.5, "speck": 2.5, "auto": 2.5}  # goal: largest ratio to the subtraction alone
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class PipelineSpeedSettings(Settings):
 class Pipeline:
     """Detection, tracking and aiming, as the loop does them for a frame."""
 
-    def __init__(self, kind: str, film: Film) -> None:
-        """Start a detector of a kind without history, for the film's size and rate."""
+    def __init__(self, kind: str, size: tuple[int, int], rate_hz: float) -> None:
+        """Start a detector of a kind without history, for images of a size [px]."""
         self.target: TargetProfile = replace(DEFAULT_TARGETS["bird"], detector=kind)
-        self.detector: Detector = make_detector(self.target, film.rate_hz)
-        self.calibration = calibration_of(film.size)
-        self.tracker, self.policy = Tracker(tracking_settings(self.target), film.size), FirstCome()
-        self.fusion = TargetFusion(self.calibration, self.target, film.size)
+        self.detector: Detector = make_detector(self.target, rate_hz)
+        self.calibration = calibration_of(size)
+        self.tracker, self.policy = Tracker(tracking_settings(self.target), size), FirstCome()
+        self.fusion = TargetFusion(self.calibration, self.target, size)
         spec = backends.describe(RigConfig())
         pan, tilt = spec.head.limits.pan, spec.head.limits.tilt
         self.reach = Reach(pan, tilt, spec.zoom.focal_range)
@@ -80,6 +80,8 @@ class Pipeline:
         detections = self.detector.detect(frame)
         detected = time.perf_counter()
         tracks = self.tracker.update(detections, frame.t)
+        if isinstance(self.detector, AutoDetector):
+            self.detector.hold(tracks)
         self.fusion.update_fixed(frame, tracks, self.detector.mask)
         number = self.policy.select(self.fusion.candidates(tracks, frame.t), np.zeros(2), self.limits)
         self.fusion.follow(number)
@@ -123,7 +125,7 @@ def one(settings: PipelineSpeedSettings, seed: int) -> list[Row]:
             return {"ms": 1e3 * (time.perf_counter() - began), "aimed": True}
 
         ways: list[tuple[str, Callable[[Frame], Row]]] = [(MIXTURE, alone)]
-        ways += [(kind, Pipeline(kind, film)) for kind in ("mog2", "motion", "speck")]
+        ways += [(kind, Pipeline(kind, film.size, film.rate_hz)) for kind in ("mog2", "motion", "speck", "auto")]
         for index, frame in enumerate(film):
             if index >= settings.frames:
                 break

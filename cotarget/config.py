@@ -405,7 +405,7 @@ class WrittenBoard:
         return BoardConfig(self.kind, self.corners, self.square)
 
 
-DETECTORS = ("colour", "motion", "speck", "mog2")
+DETECTORS = ("auto", "colour", "motion", "speck", "mog2")
 
 
 def _detector(name: str) -> str:
@@ -415,7 +415,7 @@ def _detector(name: str) -> str:
 
 
 DetectorName = Annotated[
-    str, '"colour", "motion", "speck", "mog2" or "module:function"', Check(_detector), InFolder(locate)
+    str, '"auto", "colour", "motion", "speck", "mog2" or "module:function"', Check(_detector), InFolder(locate)
 ]
 
 
@@ -427,9 +427,10 @@ class TargetProfile:
         size: true size of the dimension below [m].
         dimension: the dimension that ``size`` gives; a wingspan is the larger side of the target's box.
         wanted_px: size of that dimension in the close-up [px].
-        detector: how the fixed camera's images are searched: "colour" matches a template, "motion" subtracts the
-            background, "speck" finds targets of a few pixels, "mog2" is the paper's plain background subtraction; or a
-            function of your own from an image to boxes, in a module beside rig.toml or on Python's path.
+        detector: how the fixed camera's images are searched: "auto" finds what moves or stands out, from a few pixels
+            to half the image, "colour" matches a template, "motion" subtracts the background, "speck" finds targets of
+            a few pixels, "mog2" is the paper's plain background subtraction; or a function of your own from an image to
+            boxes, in a module beside rig.toml or on Python's path.
         template: picture of the target, cut to its outline, for the detector "colour"; relative to rig.toml.
         motion: motion model; "general" covers anything that moves by itself.
         shape: expected width over height of the target's box; none if it is unknown or changes.
@@ -438,7 +439,7 @@ class TargetProfile:
     size: Positive
     dimension: Literal["width", "height", "wingspan"]
     wanted_px: Positive
-    detector: DetectorName
+    detector: DetectorName = "auto"
     template: FilePath | None = None
     motion: Literal["standing", "walking", "flying", "general"] = "general"
     shape: Positive | None = None

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from cotarget.config import TargetProfile
-from cotarget.detection import make_detector
+from cotarget.detection import AutoDetector, make_detector
 from cotarget.drawing import draw_box, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
@@ -114,6 +114,8 @@ def _run(
     with_target = 0
     for frame in film:
         tracks = [t for t in tracker.update(detector.detect(frame), frame.t) if t.confirmed]
+        if isinstance(detector, AutoDetector):
+            detector.hold(tracks)
         for track in tracks:
             write_row(_row(film.number, frame.t, track))
         numbers.update(track.id for track in tracks)

@@ -22,7 +22,7 @@ from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome, TargetSelector
 from cotarget.control.zoom import ZoomSettings, shape_of
-from cotarget.detection import Detection, Detector, make_detector
+from cotarget.detection import AutoDetector, Detection, Detector, make_detector
 from cotarget.detection.base import flood
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices
 from cotarget.estimation import Estimate, FilterSettings
@@ -409,6 +409,8 @@ class _Run:
         interval = min(self._frames.interval, LONGEST_INTERVAL_S)
         detections = self._detector.detect(frame)
         tracks = self._tracker.update(detections, frame.t)
+        if isinstance(self._detector, AutoDetector):
+            self._detector.hold(tracks)
         zoom, found = self._estimate(frame, tracks)
         followed = self._select(tracks)
         outcome = self._search(tracks) if followed is None else self._follow(followed, frame.t, interval)

@@ -245,6 +245,7 @@ def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
 
 # What a detector needs to find a target.
 NEEDED = {
+    "auto": "what --target names has to move or stand out",
     "colour": "what --target names has to look like its template",
     "motion": "what --target names has to move",
     "mog2": "what --target names has to move",

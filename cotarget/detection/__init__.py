@@ -1,15 +1,17 @@
-"""Detect targets in the fixed camera: by colour (a book), by motion (a person), by contrast and change (a bird).
+"""Detect targets in the fixed camera: of any kind, by colour (a book), by motion (a person), by contrast (a bird).
 
-`make_detector` makes one of four by name: "colour"; "mog2", the paper's adaptive Gaussian mixture, with its foreground
-cleaned and joined to regions of a target's size; "motion", the same mixture made robust against foliage and light; and
-"speck", for small targets that may hover, seen by a camera that may shake. `ExternalDetector` makes a detector of any
-function from an image to boxes; the name "module:function" stands for one of a user's own.
+`make_detector` makes one of five by name: "auto", which finds what moves or stands out, of any size; "colour";
+"mog2", the paper's adaptive Gaussian mixture, with its foreground cleaned and joined to regions of a target's size;
+"motion", the same mixture made robust against foliage and light; and "speck", for small targets that may hover, seen by
+a camera that may shake. `ExternalDetector` makes a detector of any function from an image to boxes; the name
+"module:function" stands for one of a user's own.
 """
 
 import cv2
 import numpy as np
 
 from cotarget.config import TargetProfile
+from cotarget.detection.auto import AutoDetector
 from cotarget.detection.background import BIRD, GENERAL, PERSON, BackgroundDetector, BackgroundSettings, plain
 from cotarget.detection.base import Detection, Detector, ExternalDetector
 from cotarget.detection.color_template import ColorTemplateDetector
@@ -22,6 +24,7 @@ __all__ = [
     "BIRD",
     "GENERAL",
     "PERSON",
+    "AutoDetector",
     "BackgroundDetector",
     "BackgroundSettings",
     "ColorTemplateDetector",
@@ -49,6 +52,8 @@ def make_detector(target: TargetProfile, rate_hz: float, template: Image | None 
     if is_own(kind):
         where = f"detector '{kind}'"
         return ExternalDetector(reporting(load(kind, where), where))
+    if kind == "auto":
+        return AutoDetector(rate_hz)
     if kind == "speck":
         return SmallTargetDetector()
     if kind in ("motion", "mog2"):

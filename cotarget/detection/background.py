@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from cotarget.detection.base import Detection, box_detection, check_size, flood
+from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
 # Values in MOG2's mask: 255 is foreground, 127 a shadow.
@@ -43,6 +44,8 @@ class BackgroundSettings:
         largest: largest side of a target as a part of the image's.
         flat: parts of a wide component thinner than this part of its height lie on the ground, such as the edge of a
             shadow, and are no part of the target; 0 for none.
+        image_px: images are halved until they are at most this wide; 0 for never. All lengths are in pixels of the
+            result.
     """
 
     history_s: float
@@ -59,8 +62,11 @@ class BackgroundSettings:
     widest: float
     largest: float
     flat: float
+    image_px: int = 960
 
 
+# Interval at which the background is learnt beside what is held [s].
+LEARNING_INTERVAL_S = 0.2
 # Interval at which the background image is read from the mixture, a third of a frame's work [s].
 BACKGROUND_UPDATE_S = 0.25
 # Part of foreground pixels up to which it is faster to process them one by one than the whole image.
@@ -110,6 +116,18 @@ PERSON = BackgroundSettings(
 # A target of unknown shape may be as wide as it likes, so it may be a patch of light on the ground.
 GENERAL = replace(PERSON, bridge_px=(9, 9), smallest_px=(6, 6), smallest_area_px=40, widest=np.inf, flat=0.0)
 
+# Large targets of any kind: people and cars, from a quarter of the width of a film of 640x480. What stands side by side
+# is not bridged.
+LARGE = replace(
+    GENERAL,
+    warm_up_s=0.2,
+    threshold=20.0,
+    bridge_px=(1, 9),
+    smallest_px=(3, 3),
+    smallest_area_px=25,
+    image_px=480,
+)
+
 
 def plain(settings: BackgroundSettings) -> BackgroundSettings:
     """Give the paper's detector: the mixture with OpenCV's background ratio, and nothing against sway or light.
@@ -124,6 +142,7 @@ def plain(settings: BackgroundSettings) -> BackgroundSettings:
         brightest=1.0,
         sway_px=0,
         flat=0.0,
+        image_px=0,
     )
 
 
@@ -152,7 +171,17 @@ class BackgroundDetector:
         self._range: tuple[Image, Image] | None = None
         self._range_of: Image | None = None
         self._shape: tuple[int, ...] | None = None
-        self.mask: Image | None = None
+        self._foreground: Image | None = None
+        self.held: Sequence[tuple[Array, Array]] = ()  # centre and size of places whose background is not learnt [px]
+        self.shift: Array = np.zeros(2)  # of the camera since the background was begun, (du, dv) [px]
+
+    @property
+    def mask(self) -> Image | None:
+        """Foreground of the last frame, (H, W), 0 to 255."""
+        if self._foreground is None or self._shape is None or self._foreground.shape == self._shape[:2]:
+            return self._foreground
+        size = self._shape[1], self._shape[0]
+        return np.asarray(cv2.resize(self._foreground, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
 
     def detect(self, frame: Frame) -> list[Detection]:
         """Detect moving targets, largest first.
@@ -162,27 +191,76 @@ class BackgroundDetector:
         """
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
-        mask = self._model.apply(frame.image, learningRate=self._rate(frame.t))
+        image, factor = frame.image, 1
+        while self._settings.image_px and image.shape[1] > self._settings.image_px:
+            image = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            factor *= 2
+        shift = self.shift / factor
+        image = _shifted(image, -shift)
+        mask = self._subtract(image, frame.t, factor)
         if self._settings.shadows:
             mask = cv2.compare(mask, FOREGROUND, cv2.CMP_EQ)
         if self._settings.brightest > 1.0:
-            mask = self._unlit(mask, frame.image)
+            mask = self._unlit(mask, image)
         if self._settings.sway_px:
-            mask = _outside(mask, frame.image, self._sway())
+            mask = _outside(mask, image, self._sway())
         if self._settings.opening_px:
             mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((self._settings.opening_px,) * 2, np.uint8))
-        self.mask = mask
+        if shift.any():  # what has come into view is not known
+            seen = _shifted(np.full(mask.shape, FOREGROUND, np.uint8), -shift, cv2.BORDER_CONSTANT)
+            mask = np.asarray(cv2.bitwise_and(mask, cv2.compare(seen, FOREGROUND, cv2.CMP_EQ)), dtype=np.uint8)
+        self._foreground = _shifted(mask, shift, cv2.BORDER_CONSTANT)
         if self._learnt < self._settings.warm_up_s:
             return []
         if flood(mask):
             self._since = frame.t if self._since is None else self._since
             if frame.t - self._since >= FLOODED_S:
-                self._forget()
+                self.forget()
             return []
         self._since = None
-        return self._boxes(mask)
+        return [
+            replace(
+                each,
+                center_px=factor * (each.center_px + shift) + (factor - 1) / 2,
+                size_px=factor * each.size_px,
+            )
+            for each in self._boxes(mask)
+        ]
 
-    def _forget(self) -> None:
+    def _subtract(self, image: Image, t: float, factor: int) -> Image:
+        """Find the foreground at time ``t`` [s], and learn the background but for what is held."""
+        if not self.held or not self._learnt:
+            return np.asarray(self._model.apply(image, learningRate=self._rate(t)))
+        mask = np.asarray(self._model.apply(image, learningRate=0))
+        if self._t is None or not 0 <= t - self._t < LEARNING_INTERVAL_S:
+            held = np.zeros(mask.shape, np.uint8)
+            for center, size in self.held:
+                (left, top), (right, bottom) = (
+                    np.maximum(np.rint((center - self.shift + sign * size / 2) / factor), 0).astype(int).tolist()
+                    for sign in (-1, 1)
+                )
+                box = slice(top, bottom + 1), slice(left, right + 1)
+                if not self._is_ghost(image, mask, box):
+                    held[box] = FOREGROUND
+            self._model.apply(image, knownForegroundMask=held, learningRate=self._rate(t))
+        return mask
+
+    def _is_ghost(self, image: Image, mask: Image, box: tuple[slice, slice]) -> bool:
+        """Whether the foreground in a box stands out from its surroundings in the background and not in the image.
+
+        A target that stood there when the background was learnt, and has left, leaves such a place.
+        """
+        inside = mask[box]
+        if not 0 < cv2.countNonZero(inside) < inside.size:
+            return False
+        outside = cv2.bitwise_not(inside)
+        now, before = (
+            np.linalg.norm(np.subtract(cv2.mean(each[box], inside), cv2.mean(each[box], outside)))
+            for each in (image, self._background())
+        )
+        return bool(now < before)
+
+    def forget(self) -> None:
         """Learn the background again from the next image on."""
         self._learnt, self._t, self._since, self._known = 0.0, None, None, None
 
@@ -266,6 +344,14 @@ class BackgroundDetector:
         columns = cv2.dilate(stands, np.ones((1, self._settings.bridge_px[0]), np.uint8)).any(axis=0)
         edges = np.flatnonzero(np.diff(columns, prepend=False, append=False)).tolist()
         return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def _shifted(image: Image, shift: Array, border: int = cv2.BORDER_REPLICATE) -> Image:
+    """Move an image by (du, dv) [px]; the border's pixels fill what is uncovered, or 0 for ``BORDER_CONSTANT``."""
+    if not shift.any():
+        return image
+    matrix = np.column_stack([np.eye(2), shift])
+    return np.asarray(cv2.warpAffine(image, matrix, image.shape[1::-1], borderMode=border), dtype=np.uint8)
 
 
 def pieces(mask: Image, bridge_px: tuple[int, int]) -> list[Sequence[int]]:

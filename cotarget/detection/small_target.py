@@ -6,7 +6,7 @@ what air, codec and camera shake change of a thing that stands. While the camera
 earlier images is searched too, which finds a bird in front of foliage or beside a roof's edge.
 
 - `CameraMotion` estimates the shift of the image since the first frame.
-- `History` and `change` compare a place with earlier images, in the scene's own frame.
+- `History` and `changes` compare a place with earlier images, in the scene's own frame.
 - `find_small_targets` compares each place with the ring around it at several scales, a constant false alarm rate
   detector (Rohling 1983) in two dimensions.
 
@@ -16,7 +16,7 @@ In rig.toml this detector is called "speck". Measurements: docs/design-notes.md.
 import functools
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -191,15 +191,15 @@ class History:
         return found
 
 
-def change(
+def changes(
     grey: Image,
     low: tuple[int, int],
     size: tuple[int, int],
     around: float,
     shift: Array,
     noise: float,
-    before: tuple[Image, Array],
-) -> float:
+    references: Sequence[tuple[Image, Array] | None],
+) -> list[float]:
     """Measure the part of a target's contrast that was not there before: 0 for nothing, 1 for all of it.
 
     It is relative to the target's own contrast, so that it does not depend on the light.
@@ -211,33 +211,42 @@ def change(
         around: grey level of the surroundings.
         shift: the camera's shift now, (2,) [px].
         noise: standard deviation of the image noise [grey levels].
-        before: earlier image, and the camera's shift then.
+        references: earlier images and the camera's shift then; None where there is none.
 
     Returns:
-        The change; 0 if the place was not in view before, because a border that comes into view is no target.
+        The change since each; nan where there is none, and 0 if the place was not in view then, because a border that
+        comes into view is no target.
     """
-    earlier, shift_then = before
     left, top = max(0, low[0] - MARGIN_PX), max(0, low[1] - MARGIN_PX)
     patch = grey[top : low[1] + size[1] + MARGIN_PX, left : low[0] + size[0] + MARGIN_PX]
     h, w = patch.shape
-    du, dv = (shift_then - shift).tolist()
-    # getRectSubPix takes the centre of a patch: n pixels from column x are centred at x + (n - 1) / 2.
-    u, v = left + (w - 1) / 2 + du, top + (h - 1) / 2 + dv
-    if not ((w - 1) / 2 <= u + 0.5 and u - 0.5 <= grey.shape[1] - (w + 1) / 2):
-        return 0.0
-    if not ((h - 1) / 2 <= v + 0.5 and v - 0.5 <= grey.shape[0] - (h + 1) / 2):
-        return 0.0
-    search = min(MOST_SEARCH_PX, SEARCH_PX + round(SEARCH_PART * math.hypot(du, dv)))
-    then = cv2.getRectSubPix(earlier, (w + 2 * search, h + 2 * search), (u, v))
     now = patch.astype(np.float32)
-    brightened = then + np.float32(_level(patch) - _level(then))  # flickering light is no change
-    squared = float(cv2.matchTemplate(brightened, now, cv2.TM_SQDIFF).min())
-    excess = max(0.0, squared - 2 * noise**2 * w * h)
-    energy = float(np.sum(np.square(now - np.float32(around)))) + noise**2 * w * h
-    return excess / energy
+    level = _level(now)
+    energy = float(np.square(now - np.float32(around)).sum()) + noise**2 * w * h
+    found = []
+    for before in references:
+        if before is None:
+            found.append(math.nan)
+            continue
+        earlier, shift_then = before
+        du, dv = (shift_then - shift).tolist()
+        # getRectSubPix takes the centre of a patch: n pixels from column x are centred at x + (n - 1) / 2.
+        u, v = left + (w - 1) / 2 + du, top + (h - 1) / 2 + dv
+        if not all(
+            (n - 1) / 2 <= x + 0.5 and x - 0.5 <= of - (n + 1) / 2
+            for x, n, of in ((u, w, grey.shape[1]), (v, h, grey.shape[0]))
+        ):
+            found.append(0.0)
+            continue
+        search = min(MOST_SEARCH_PX, SEARCH_PX + round(SEARCH_PART * math.hypot(du, dv)))
+        then = cv2.getRectSubPix(earlier, (w + 2 * search, h + 2 * search), (u, v), patchType=cv2.CV_32F)
+        then += np.float32(level - _level(then))  # flickering light is no change
+        squared = cv2.minMaxLoc(cv2.matchTemplate(then, now, cv2.TM_SQDIFF))[0]
+        found.append(max(0.0, squared - 2 * noise**2 * w * h) / energy)
+    return found
 
 
-def _level(patch: Image) -> float:
+def _level(patch: np.ndarray) -> float:
     """Mean grey level of a patch's rim, which is the target's surroundings."""
     return (cv2.mean(patch[0])[0] + cv2.mean(patch[-1])[0] + cv2.mean(patch[:, :1])[0] + cv2.mean(patch[:, -1:])[0]) / 4
 
@@ -248,12 +257,16 @@ def _level(patch: Image) -> float:
 INNER_PX = 3
 # Inner and outer side of the ring, in pixels of an image of half the size: 14 and 22 px. The target lies inside.
 GUARD_HALF_PX, OUTER_HALF_PX = 7, 11
-# Scales, for targets of up to 12 px to those of up to 400.
-SCALES = 6
+# Scales, for targets of up to 12 px to those of up to 400; in the difference, of up to 50.
+SCALES, SCALES_OF_DIFFERENCE = 6, 3
+# How far the largest ring of the difference reaches, and the side of a pixel of its largest scale [px].
+REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES_OF_DIFFERENCE, 2**SCALES_OF_DIFFERENCE
 # First scale whose ring, 90 px, is so large that a sky's gradient counts.
 SLOPING_SCALE = 2
 # Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
 LEAST_ROUGHNESS = 1.5
+# How far beside a target other texture counts: in parts of its larger side, and in pixels of the texture.
+BESIDE, BESIDE_PX = 2.0, 6.0
 # Part of the contrast at which a target's outline lies.
 OUTLINE = 0.33
 # From this scale on, wings and rotors that are fainter than the body belong to the target: what stands out by this
@@ -278,6 +291,7 @@ class SmallTarget:
         contrast: grey level of its centre less that of the surroundings; negative if darker.
         signal: absolute contrast, in standard deviations of the surroundings.
         around: mean grey level of the surroundings.
+        beside: largest texture beside it [grey levels]: little in the sky, much at a mast or a twig; inf if unknown.
     """
 
     low: tuple[int, int]
@@ -285,81 +299,141 @@ class SmallTarget:
     contrast: float
     signal: float
     around: float
+    beside: float = 0.0
 
 
-def find_small_targets(grey: Image, threshold: float, most: int, *, faint: bool = True) -> list[SmallTarget]:
+def find_small_targets(
+    grey: Image,
+    threshold: float,
+    most: int,
+    *,
+    finer: Sequence[Image] = (),
+    scales: int = SCALES,
+    of_difference: bool = False,
+) -> list[SmallTarget]:
     """Find regions that stand out at any scale, without overlaps, the strongest first.
 
     Args:
         grey: image, (H, W).
         threshold: least contrast, in standard deviations of the surroundings.
         most: most regions returned, and most examined at each scale; bounds the computing time.
-        faint: whether faint parts of a large region belong to it, and its texture makes it stand out.
+        finer: images of which ``grey`` is a halving, the finest first; outlines and boxes are in pixels of the first.
+        scales: number of scales.
+        of_difference: whether the image is a difference of two, in which dark regions and texture mean nothing.
     """
-    found: list[SmallTarget] = []
-    levels = [grey]
+    levels, first = [*finer, grey], len(finer)
     texture: Image | None = None
-    for scale in range(SCALES):
+    peaks: list[_Peak] = []
+    for scale in range(first, first + scales):
         level = levels[scale]
         if min(level.shape) < 2 * OUTER_HALF_PX:
             break
-        half = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        levels.append(half)
-        peaks = _peaks(level, half, scale >= SLOPING_SCALE, threshold, most)
-        if texture is not None:
+        levels.append(cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        above = levels[scale - 1] if scale == first and first else None
+        peaks += _peaks(level, levels[-1], scale, scale - first >= SLOPING_SCALE, threshold, most, above)
+        if scale - first > LARGE_SCALE and texture is not None:
             texture = cv2.resize(texture, level.shape[::-1], interpolation=cv2.INTER_AREA)
-            peaks += _textured(texture, half, threshold, most)
-        elif faint and scale == LARGE_SCALE:
-            texture = cv2.absdiff(level, cv2.blur(level, TEXTURE_PX))
-        for u, v, signal, around in peaks:
-            target = _outline(levels, (u, v), scale, signal, around, faint)
-            if target is not None:
-                found.append(target)
-    found.sort(key=lambda target: -target.signal)
+            peaks += _textured(texture, levels[-1], scale, threshold, most)
+        elif scale - first == LARGE_SCALE and not of_difference:
+            texture = fine_texture = cv2.absdiff(level, cv2.blur(level, TEXTURE_PX))
+    peaks.sort(key=lambda peak: -peak.signal)
     kept: list[SmallTarget] = []
-    for target in found:
-        if not any(share(target, other) for other in kept):
+    for peak in peaks:
+        at = (peak.u + 0.5) * 2**peak.scale, (peak.v + 0.5) * 2**peak.scale
+        if any(_contains(target, at) for target in kept):
+            continue
+        large = peak.scale - first >= LARGE_SCALE
+        target = _outline(levels, peak, large, of_difference)
+        if target is not None and not any(share(target, other) for other in kept):
             kept.append(target)
-    return kept[:most]
+            if len(kept) == most:
+                break
+    if texture is None:
+        return kept
+    return [replace(target, beside=_beside(fine_texture, target, 2 ** (first + LARGE_SCALE))) for target in kept]
+
+
+def _contains(target: SmallTarget, at: tuple[float, float]) -> bool:
+    """Whether a target's box contains a place [px]."""
+    return all(low <= x < low + size for low, size, x in zip(target.low, target.size, at, strict=True))
+
+
+def _beside(texture: Image, target: SmallTarget, unit: int) -> float:
+    """Find the largest texture around a target but not in it; ``unit`` is the side of the texture's pixels [px]."""
+    side = max(target.size) / unit
+    u, v = ((low + size / 2) / unit for low, size in zip(target.low, target.size, strict=True))
+    outer, inner = (0.5 + BESIDE) * side + BESIDE_PX, 0.75 * side + 2
+    left, top = max(0, round(u - outer)), max(0, round(v - outer))
+    window = texture[top : round(v + outer) + 1, left : round(u + outer) + 1].copy()
+    x, y = max(0, round(u - inner) - left), max(0, round(v - inner) - top)
+    window[y : round(v + inner) - top + 1, x : round(u + inner) - left + 1] = 0
+    return float(window.max(initial=0))
+
+
+@dataclass(frozen=True)
+class _Peak:
+    """A peak of contrast: its pixel (u, v) at a scale, its signal, and the ring's mean."""
+
+    u: int
+    v: int
+    scale: int
+    signal: float
+    around: float
 
 
 def _peaks(
-    level: Image, half: Image, sloping: bool, threshold: float, most: int
-) -> list[tuple[int, int, float, float]]:
-    """Find peaks of contrast at one scale, the strongest first: u, v, signal, and the ring's mean."""
+    level: Image, half: Image, scale: int, sloping: bool, threshold: float, most: int, finer: Image | None = None
+) -> list[_Peak]:
+    """Find peaks of contrast at one scale, the strongest first.
+
+    Args:
+        level: image at this scale, (H, W).
+        half: the same in half the size.
+        scale: number of halvings.
+        sloping: whether to fit a plane to the ring.
+        threshold: least contrast, in standard deviations of the surroundings.
+        most: most peaks.
+        finer: image of twice the size in which the contrast is searched, because a target of four pixels fades in the
+            mean; None to search this one.
+    """
     mean, deviation = _ring(half, sloping)
     margin = deviation * np.float32(threshold)
     size = (level.shape[1], level.shape[0])
     # In bytes, which is three times as fast; half a grey level is little beside `threshold` deviations.
     low = cv2.resize(cv2.subtract(mean, margin, dtype=cv2.CV_8U), size)
     high = cv2.resize(cv2.add(mean, margin, dtype=cv2.CV_8U), size)
-    middle = cv2.boxFilter(level, -1, (INNER_PX, INNER_PX))
-    mask = cv2.bitwise_not(cv2.inRange(middle, low, high))
+    dark = bright = cv2.boxFilter(level if finer is None else finer, -1, (INNER_PX, INNER_PX))
+    if finer is not None:
+        pair = np.ones((2, 2), np.uint8)
+        dark, bright = (
+            cv2.resize(of(dark, pair), size, interpolation=cv2.INTER_NEAREST) for of in (cv2.erode, cv2.dilate)
+        )
+    off = cv2.max(cv2.subtract(low, dark), cv2.subtract(bright, high))
+    mask = cv2.compare(off, 0, cv2.CMP_GT)
     peaks = []
     for contour in cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
         x, y, w, h = cv2.boundingRect(contour)
         if max(w, h) > 2 * GUARD_HALF_PX:  # it reaches into its own ring and is left to the next scale
             continue
-        there = (slice(y, y + h), slice(x, x + w))
-        off = np.maximum(cv2.subtract(low[there], middle[there]), cv2.subtract(middle[there], high[there]))
-        j, i = np.unravel_index(int(np.argmax(off)), off.shape)
-        u, v = x + int(i), y + int(j)
+        _, _, _, (i, j) = cv2.minMaxLoc(off[y : y + h, x : x + w])
+        u, v = x + i, y + j
         at = (min(v // 2, half.shape[0] - 1), min(u // 2, half.shape[1] - 1))
         around, rough = float(mean[at]), float(deviation[at])
-        peaks.append((u, v, abs(float(middle[v, u]) - around) / rough, around))
-    peaks.sort(key=lambda peak: -peak[2])
+        contrast = max(float(bright[v, u]) - around, around - float(dark[v, u]))
+        peaks.append(_Peak(u, v, scale, contrast / rough, around))
+    peaks.sort(key=lambda peak: -peak.signal)
     return peaks[:most]
 
 
-def _textured(texture: Image, half: Image, threshold: float, most: int) -> list[tuple[int, int, float, float]]:
+def _textured(texture: Image, half: Image, scale: int, threshold: float, most: int) -> list[_Peak]:
     """Find peaks of texture, as `_peaks` does, with the mean of the ring in the image of half the size."""
     coarse = cv2.resize(texture, half.shape[::-1], interpolation=cv2.INTER_AREA)
-    peaks = _peaks(texture, coarse, False, threshold, most)
+    peaks = _peaks(texture, coarse, scale, False, threshold, most)
     if not peaks:
         return []
     mean, _ = _ring(half, False)
     height, width = mean.shape
-    return [(u, v, signal, float(mean[min(v // 2, height - 1), min(u // 2, width - 1)])) for u, v, signal, _ in peaks]
+    return [replace(p, around=float(mean[min(p.v // 2, height - 1), min(p.u // 2, width - 1)])) for p in peaks]
 
 
 def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
@@ -403,22 +477,19 @@ def _first_moment(half: Image, side: int, axis: int) -> Array:
     return np.asarray(cv2.sepFilter2D(half, cv2.CV_32F, kernels[0], kernels[1]))
 
 
-def _outline(
-    levels: list[Image], peak: tuple[int, int], scale: int, signal: float, around: float, faint: bool
-) -> SmallTarget | None:
+def _outline(levels: Sequence[Image], peak: _Peak, large: bool, of_difference: bool) -> SmallTarget | None:
     """Find the box of a peak, in the image of a finer scale; None if its outline leaves the ring.
 
     Args:
         levels: image, (H, W), and its halvings.
-        peak: the peak in pixels of its scale (u, v).
-        scale: number of halvings.
-        signal: contrast in standard deviations of the surroundings.
-        around: mean grey level of the surroundings.
-        faint: whether faint parts of a large region belong to it.
+        peak: the peak.
+        large: whether faint parts belong to the target.
+        of_difference: whether the target is brighter than its surroundings in all its parts, as in a difference.
     """
+    scale, around = peak.scale, peak.around
     fine = max(0, scale - WINDOW_SCALES)
     image, factor, unit = levels[fine], 2 ** (scale - fine), 2**fine
-    u, v = factor * peak[0] + factor // 2, factor * peak[1] + factor // 2
+    u, v = factor * peak.u + factor // 2, factor * peak.v + factor // 2
     reach = factor * GUARD_HALF_PX
     left, top = max(0, u - reach), max(0, v - reach)
     window = image[top : v + reach + 1, left : u + reach + 1].astype(np.float32) - np.float32(around)
@@ -426,9 +497,11 @@ def _outline(
     j, i = (int(n) for n in np.unravel_index(int(np.argmax(np.abs(near))), near.shape))
     contrast = float(near[j, i])
     at = max(0, v - top - factor) + j, max(0, u - left - factor) + i
-    x, y, w, h = _component(window * np.sign(contrast) > OUTLINE * abs(contrast), at)
-    if faint and scale >= LARGE_SCALE:
-        part = min(OUTLINE, max(FAINT / signal, FAINTEST))
+    # An aeroplane has bright and dark parts.
+    inside = window * np.sign(contrast) if of_difference else np.abs(window)
+    x, y, w, h = _component(inside > OUTLINE * abs(contrast), at)
+    if large and not of_difference:
+        part = min(OUTLINE, max(FAINT / peak.signal, FAINTEST))
         X, Y, W, H = _component(np.abs(window - _slope(window)) > part * abs(contrast), at)
         if max(x - X, y - Y, X + W - x - w, Y + H - y - h) * unit > BLUR_PX + unit:
             x, y, w, h = X, Y, W, H
@@ -437,7 +510,7 @@ def _outline(
     down = (y == 0 and top > 0) or (y + h == bottom and top + bottom < image.shape[0])
     if across or down:
         return None  # it goes on beyond its ring: a pole, or a target for the next scale
-    return SmallTarget((unit * (left + x), unit * (top + y)), (unit * w, unit * h), contrast, signal, around)
+    return SmallTarget((unit * (left + x), unit * (top + y)), (unit * w, unit * h), contrast, peak.signal, around)
 
 
 def _slope(window: np.ndarray) -> np.ndarray:
@@ -473,11 +546,13 @@ MOST_TARGETS = 40
 STANDING_CHANGE = (0.05, 0.08, 0.15, 0.20)
 # Added to a change before its logarithm is taken: smaller changes cannot be measured.
 LEAST_CHANGE = 0.02
-# The score is the logistic function of SLOPE ln(signal x change / EVEN), 0.5 at EVEN. Both were fitted to 13 labelled
-# films of that collection, with a target and something else taken as equally likely.
-SLOPE, EVEN = 3.4, 18.0
+# The score is the logistic function of these times the logarithms of signal, change and texture beside the target, plus
+# the last. They were fitted to 41 labelled films, with target and others taken as equally likely in every film.
+OF_SIGNAL, OF_CHANGE, OF_TEXTURE, EVEN = 2.57, 3.14, -1.44, -3.52
 # Largest signal that counts: a stronger one does not make up for a lack of change.
-CLEAR_SIGNAL = 20.0
+CLEAR_SIGNAL = 30.0
+# Steepness of the score of a region of the difference.
+SLOPE = 3.4
 # Least score of a detection; a target that stays quiet for a moment is above it.
 LEAST_SCORE = 0.02
 # Score from which a region is more likely a target than not.
@@ -500,6 +575,8 @@ USUAL_TIMES, USUAL_GAIN, SWAY_PX = 3.0, 0.02, 5
 # Largest score of a clipped box, which may continue a track but not begin one: half of its surroundings are outside the
 # image, so a swaying twig looks isolated.
 MOST_CLIPPED_SCORE = 0.45
+# Images are halved until they are at most this wide [px]. Targets are outlined in full resolution.
+WIDEST_PX = 960
 # Least span of the history before anything is detected [s].
 WARM_UP_S = AGES_S[1]
 
@@ -507,11 +584,13 @@ WARM_UP_S = AGES_S[1]
 class SmallTargetDetector:
     """Detect small targets by contrast and change, each with a score."""
 
-    def __init__(self) -> None:
-        """Start without history."""
-        self._camera = CameraMotion()
+    def __init__(self, least_score: float = LEAST_SCORE) -> None:
+        """Start without history; ``least_score`` is that of a detection."""
+        self._least_score = least_score
+        self.camera = CameraMotion()
         self._history = History()
         self._usual: Image | None = None  # mean difference from earlier images, float32
+        self.shift: Array = np.zeros(2)  # of the camera since the first frame [px], (2,)
         self._shape: tuple[int, ...] | None = None
         self.mask: Image | None = None
 
@@ -523,42 +602,50 @@ class SmallTargetDetector:
         Raises:
             CotargetError: the image's size changed.
         """
+        return [detection for _, detection in self.find(frame)]
+
+    def find(self, frame: Frame) -> list[tuple[SmallTarget, Detection]]:
+        """Detect as `detect` does; also return the region of each detection, in full resolution."""
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
-        shift = self._camera.update(grey)
-        if self._camera.jumped:
+        finer: list[Image] = []
+        while grey.shape[1] > WIDEST_PX:
+            finer.append(grey)
+            grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        unit = 2 ** len(finer)
+        shift = self.camera.update(grey)
+        self.shift = unit * shift
+        if self.camera.jumped:
             self._history.clear()
         references = self._history.references(frame.t)
         fresh = self._history.add(frame.t, grey, shift)
-        self.mask = np.zeros(grey.shape, np.uint8)
+        self.mask = np.zeros(frame.image.shape[:2], np.uint8)
         if not fresh or self._history.span < WARM_UP_S:
             return []
         found: list[tuple[SmallTarget, Detection]] = []
         arrived: list[tuple[SmallTarget, Detection]] = []
-        for target in find_small_targets(grey, LEAST_SIGNAL, MOST_TARGETS):
-            changes = [
-                change(grey, target.low, target.size, target.around, shift, self._history.noise, before)
-                if before is not None
-                else np.nan
-                for before in references
-            ]
-            detection = box_detection(*target.low, *target.size, small_target_score(target.signal, changes), grey.shape)
+        for target in find_small_targets(grey, LEAST_SIGNAL, MOST_TARGETS, finer=finer):
+            low = target.low[0] // unit, target.low[1] // unit
+            size = -(-target.size[0] // unit), -(-target.size[1] // unit)
+            since = changes(grey, low, size, target.around, shift, self._history.noise, references)
+            score = small_target_score(target.signal, since, target.beside)
+            detection = box_detection(*target.low, *target.size, score, frame.image.shape)
             if detection.clipped:
                 detection = replace(detection, score=min(detection.score, MOST_CLIPPED_SCORE))
-            if detection.score >= LEAST_SCORE:
+            if detection.score >= self._least_score:
                 found.append((target, detection))
-            if detection.score >= BELIEVED_SCORE and np.nanmax(changes) >= ARRIVED:
+            if detection.score >= BELIEVED_SCORE and np.nanmax(since) >= ARRIVED:
                 arrived.append((target, detection))
-        differing = self._differing(grey, shift, references)
+        differing = self._differing(grey, unit, shift, references)
         found = _best_of(found + [_as_a_whole(pair, arrived) for pair in differing])
         for target, detection in reversed(found):
             (x, y), (w, h) = target.low, target.size
             self.mask[y : y + h, x : x + w] = round(255 * detection.score)
-        return [detection for _, detection in found]
+        return found
 
     def _differing(
-        self, grey: Image, shift: Array, references: list[tuple[Image, Array] | None]
+        self, grey: Image, unit: int, shift: Array, references: list[tuple[Image, Array] | None]
     ) -> list[tuple[SmallTarget, Detection]]:
         """Find regions in the difference from all earlier images, if there are enough and the camera stood still."""
         earlier = [kept for kept in references if kept is not None]
@@ -568,13 +655,31 @@ class SmallTargetDetector:
         difference = functools.reduce(cv2.min, (cv2.absdiff(grey, picture) for picture, _ in earlier))
         if self._usual is None:
             self._usual = np.zeros(grey.shape, np.float32)
-        nearby = cv2.dilate(self._usual, np.ones((SWAY_PX, SWAY_PX), np.uint8))
+        usual = cv2.dilate(cv2.convertScaleAbs(self._usual, alpha=USUAL_TIMES), np.ones((SWAY_PX, SWAY_PX), np.uint8))
         cv2.accumulateWeighted(difference, self._usual, USUAL_GAIN)
-        unusual = cv2.subtract(difference, nearby * np.float32(USUAL_TIMES), dtype=cv2.CV_8U)
+        unusual = cv2.subtract(difference, usual)
+        # A sky is zero but for the target; its surroundings are needed as well.
+        least = LEAST_DIFFERENCE * LEAST_ROUGHNESS
+        left, top, width, height = cv2.boundingRect(cv2.compare(cv2.blur(unusual, (INNER_PX,) * 2), least, cv2.CMP_GE))
+        if not width:
+            return []
+        left, top, right, bottom = (left - REACH_PX, top - REACH_PX, left + width + REACH_PX, top + height + REACH_PX)
+        left, top = max(0, left) // ALIGNED_PX * ALIGNED_PX, max(0, top) // ALIGNED_PX * ALIGNED_PX
         found = []
-        for target in find_small_targets(unusual, LEAST_DIFFERENCE, MOST_TARGETS, faint=False):
+        for target in find_small_targets(
+            unusual[top:bottom, left:right],
+            LEAST_DIFFERENCE,
+            MOST_TARGETS,
+            scales=SCALES_OF_DIFFERENCE,
+            of_difference=True,
+        ):
             score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE)) if target.contrast > 0 else 0.0
-            detection = box_detection(*target.low, *target.size, score, grey.shape)
+            (x, y), (w, h) = target.low, target.size
+            target = replace(
+                target, low=(unit * (left + x), unit * (top + y)), size=(unit * w, unit * h), beside=math.inf
+            )
+            shape = unit * grey.shape[0], unit * grey.shape[1]
+            detection = box_detection(*target.low, *target.size, score, shape)
             if detection.clipped:
                 detection = replace(detection, score=min(score, MOST_CLIPPED_SCORE))
             if detection.score >= LEAST_SCORE:
@@ -607,19 +712,26 @@ def _best_of(found: list[tuple[SmallTarget, Detection]]) -> list[tuple[SmallTarg
     return kept
 
 
-def small_target_score(signal: float, changes: list[float]) -> float:
+def small_target_score(signal: float, since: Sequence[float], beside: float) -> float:
     """Probability that a region is a target and not a standing thing, 0 to 1.
 
     Args:
         signal: contrast in standard deviations of the surroundings.
-        changes: change since each of AGES_S, nan if unknown.
+        since: change since each of AGES_S, nan if unknown.
+        beside: largest texture beside the region [grey levels].
     """
     ratios = [
-        np.log((c + LEAST_CHANGE) / (usual + LEAST_CHANGE))
-        for c, usual in zip(changes, STANDING_CHANGE, strict=True)
-        if np.isfinite(c)
+        math.log((c + LEAST_CHANGE) / (usual + LEAST_CHANGE))
+        for c, usual in zip(since, STANDING_CHANGE, strict=True)
+        if not math.isnan(c)
     ]
     if not ratios:
         return 0.0
     ratios = [min(ratio, ratios[0] + MOST_RISE) for ratio in ratios]
-    return float(1 / (1 + np.exp(-SLOPE * (np.log(min(signal, CLEAR_SIGNAL) / EVEN) + np.mean(ratios)))))
+    logit = (
+        OF_SIGNAL * math.log(min(signal, CLEAR_SIGNAL))
+        + OF_CHANGE * sum(ratios) / len(ratios)
+        + OF_TEXTURE * math.log1p(beside)
+        + EVEN
+    )
+    return 1 / (1 + math.exp(-logit))

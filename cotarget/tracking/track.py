@@ -9,7 +9,7 @@ import math
 import statistics
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -210,6 +210,10 @@ class Measurement(Protocol):
         """Whether the image's border cuts the box."""
 
 
+# Width of the images for which the settings hold [px].
+USUAL_WIDTH_PX = 640
+
+
 @dataclass(frozen=True)
 class TrackingSettings:
     """Settings of the image filter, of a track's life cycle and of the association.
@@ -221,8 +225,11 @@ class TrackingSettings:
         speed_px: standard deviation of a new track's speed [px/s].
         confirm_hits: fewest detections of a confirmed track.
         confirm_travel: least travel of a confirmed track, in larger sides of its box; 0 if it may stand still.
+        least_travel: least travel of a confirmed track, in parts of the image's width.
         travel_s: window of that travel [s].
-        confirm_score: least average score of a confirmed track, the last detections weighted most; 0 for any.
+        confirm_score: least average score of a confirmed track, the last detections weighted most; 0 for any. With
+            `confirm_travel` too, half of it is enough for a track that has travelled.
+        start_score: a detection with a lower score only continues a confirmed track.
         score_s: time constant of the average score [s]; a new track begins at 0.
         lose_s: time without a detection after which a confirmed track ends [s]; its age if that is less.
         drop_s: time without a detection after which an unconfirmed track ends [s].
@@ -249,8 +256,10 @@ class TrackingSettings:
     speed_px: float = 120.0
     confirm_hits: int = 4
     confirm_travel: float = 0.0
+    least_travel: float = 0.0
     travel_s: float = 2.0
     confirm_score: float = 0.0
+    start_score: float = 0.0
     score_s: float = 0.3
     lose_s: float = 0.8
     drop_s: float = 0.13
@@ -261,6 +270,14 @@ class TrackingSettings:
     overlap_enough: float = 0.3
     covered: float = 0.5
     most_detections: int = 100
+
+    def scaled(self, width: int) -> "TrackingSettings":
+        """Scale speed and acceleration, which are those in an image of 640 px, to a larger width [px].
+
+        The noise of a detection's centre is that of its outline, in pixels of any image.
+        """
+        factor = max(1.0, width / USUAL_WIDTH_PX)
+        return replace(self, speed_px=factor * self.speed_px, process_noise=factor**2 * self.process_noise)
 
 
 # Settings that differ from the defaults, by the target's motion model and by the detector. The centre of a box jitters
@@ -274,6 +291,7 @@ BY_MOTION: Mapping[str, Mapping[str, float]] = {
 BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
     "colour": {"noise_px": 0.2, "noise_of_size": 0.01},
     "speck": {"confirm_score": 0.5},
+    "auto": {"confirm_score": 0.5, "confirm_travel": 0.5, "least_travel": 0.03, "start_score": 0.02},
     "motion": {"confirm_travel": 0.5},
     "mog2": {"confirm_travel": 0.5},
 }
@@ -347,6 +365,8 @@ class LiveTrack:
         self.hits = 1
         self.missed = 0
         self.confirmed = False
+        self.is_part = False  # whether it lies in a larger confirmed track
+        self._image_size = image_size
         self.mean_score = 0.0
         self._sizes = SizeHistory(settings.size_s)
         # Travel is needed until the track is confirmed, and only if the settings ask for it.
@@ -389,12 +409,7 @@ class LiveTrack:
         self.detection, self.shared = detection, False
         self.hits += 1
         if not self.confirmed:
-            settings = self.settings
-            self.confirmed = (
-                self.hits >= settings.confirm_hits
-                and self.mean_score >= settings.confirm_score
-                and self._has_travelled()
-            )
+            self.confirmed = self.hits >= self.settings.confirm_hits and not self.is_part and self._has_evidence()
             if self.confirmed:
                 self._trail = None
 
@@ -463,11 +478,17 @@ class LiveTrack:
             if history is not None:
                 history.add(self.t, (u, v), (width, height), detection.clipped)
 
-    def _has_travelled(self) -> bool:
-        """Whether the track has travelled far enough to be confirmed."""
+    def _has_evidence(self) -> bool:
+        """Whether the score shows a target, or the travel together with half that score."""
+        least = self.settings.confirm_score
         if self._trail is None:
-            return True
-        return self._trail.travel() >= self.settings.confirm_travel * max(1.0, *self.size.tolist())
+            return self.mean_score >= least
+        return self.mean_score >= least > 0 or (self.mean_score >= least / 2 and self._has_travelled(self._trail))
+
+    def _has_travelled(self, trail: Trail) -> bool:
+        """Whether the track has travelled far enough to be confirmed."""
+        least = self.settings.least_travel * (self._image_size or (0, 0))[0]
+        return trail.travel() >= max(least, self.settings.confirm_travel * max(1.0, *self.size.tolist()))
 
     def _measure(self, center: Sequence[float], variance: Sequence[float]) -> None:
         """Correct with a measured centre [px] and its variances [px^2], (2,) each."""

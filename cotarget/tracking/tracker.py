@@ -25,6 +25,8 @@ from cotarget.tracking.track import (
 __all__ = ["Measurement", "Track", "Tracker", "TrackingSettings", "tracking_settings"]
 # Cost of pairs that must not be matched; no assignment inside the gate reaches it.
 IMPOSSIBLE = 1e6
+# What lies to this part in a confirmed track's box, enlarged by a factor, belongs to it: a shoe, a rotor.
+PART, NEAR = 0.5, 1.5
 
 
 class Tracker:
@@ -35,9 +37,11 @@ class Tracker:
 
         Args:
             settings: settings of filters and life cycle.
-            image_size: (width, height) [px]; with it, a track ends when it leaves the image.
+            image_size: (width, height) [px]; with it, a track ends when it leaves the image, and the settings are
+                scaled to its width.
         """
-        self._settings = settings or TrackingSettings()
+        settings = settings or TrackingSettings()
+        self._settings = settings if image_size is None else settings.scaled(image_size[0])
         self._image_size = image_size
         self._tracks: list[LiveTrack] = []
         self._next_id = 1
@@ -74,7 +78,9 @@ class Tracker:
             matches = _assign(pairs)
             merged = _merged(pairs, matches)
         taken = set(matches.values())
+        parts = self._parts()
         for i, state in enumerate(self._tracks):
+            state.is_part = parts[i]
             if i in merged:
                 state.correct_shared(detections[merged[i]])
             elif i in matches:
@@ -82,7 +88,8 @@ class Tracker:
             else:
                 state.missed += 1
         self._tracks = [s for s in self._tracks if not s.is_over(self._image_size)]
-        self._start_tracks([detection for j, detection in enumerate(detections) if j not in taken], t)
+        least = self._settings.start_score
+        self._start_tracks([each for j, each in enumerate(detections) if j not in taken and each.score >= least], t)
         return self.tracks
 
     def _begin(self, t: float) -> None:
@@ -97,6 +104,15 @@ class Tracker:
         if self._t is not None and t > self._t:
             self._interval = t - self._t
         self._t = t
+
+    def _parts(self) -> list[bool]:
+        """Whether each track lies mostly in a larger confirmed one."""
+        at, size = _boxes_of(self._tracks)
+        area = _area(size)
+        confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
+        inside = _shared(at, NEAR * size, at, size) > PART * area
+        larger = area[:, None] > area
+        return np.any(inside & larger & confirmed[:, None], axis=0).tolist()
 
     def _most_useful(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
         """Select at most `most_detections` detections, in their order."""
@@ -118,7 +134,11 @@ class Tracker:
         covered = self._settings.covered
         at, size = _boxes_of(self._tracks)
         center, extent = _boxes(detections)
-        free = np.all(_shared(at, size, center, extent) <= covered * _area(size)[:, None], axis=0)
+        shared = _shared(at, size, center, extent)
+        free = np.all(shared <= covered * _area(size)[:, None], axis=0)
+        confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
+        near = _shared(at[confirmed], NEAR * size[confirmed], center, extent)
+        free &= np.all(near <= PART * _area(extent), axis=0)
         covers = _shared(center, extent, center, extent) > covered * _area(extent)[:, None]
         for j, detection in enumerate(detections):
             if free[j]:  # detections that cover this new track are no further target
@@ -164,24 +184,33 @@ class _Pairs:
         shared = _shared(at, size, center, extent)
         self.covered: Array = shared / own
         overlap = shared / (own + other - shared)
-        new_object = self.distance + self.log_volume > _least_likely(states, image_size)
+        weak = np.array([detection.score < settings.start_score for detection in detections], dtype=bool)
+        clutter = np.where(weak, float(np.count_nonzero(weak)), 0.0)
+        new_object = self.distance + self.log_volume > _least_likely(states, image_size, clutter)
+        new_object |= weak & ~np.array(self.confirmed)[:, None]
         # A target whose box merged with another still overlaps its track.
         self.possible = ((self.distance <= settings.gate) & ~new_object) | (overlap > settings.overlap_enough)
 
 
-def _least_likely(states: Sequence[LiveTrack], image_size: tuple[int, int] | None) -> Array:
-    """Largest distance plus log volume at which a detection is no new object, (tracks, 1).
+def _least_likely(states: Sequence[LiveTrack], image_size: tuple[int, int] | None, clutter: Array) -> Array:
+    """Largest distance plus log volume at which a detection is no new object, (tracks, detections).
 
     A target hidden for some time reappears at a rate of about once in that time, with a normal density; new objects
-    appear anywhere. A track that the last frame detected has no such limit.
+    appear anywhere. A track that the last frame detected has no such limit, but for detections too weak to begin a
+    track, of which there are some everywhere.
+
+    Args:
+        states: tracks.
+        image_size: (width, height) [px].
+        clutter: number of weak detections in this frame for a weak one, and 0 for the others, (detections,).
     """
-    limits = np.full((len(states), 1), np.inf)
-    if image_size is not None:
-        density = states[0].settings.newcomers_hz / math.prod(image_size)
-        for i, state in enumerate(states):
-            if state.missed:
-                limits[i] = -2 * math.log(2 * math.pi * density * (state.t - state.seen))
-    return limits
+    if image_size is None:
+        return np.full((len(states), len(clutter)), np.inf)
+    rate = states[0].settings.newcomers_hz
+    hidden_s = np.array([[state.t - state.seen if state.missed else 0.0] for state in states])
+    density = (rate * hidden_s + clutter) / math.prod(image_size)
+    with np.errstate(divide="ignore"):
+        return np.asarray(-2 * np.log(2 * math.pi * density))
 
 
 def _boxes_of(states: Sequence[LiveTrack]) -> tuple[Array, Array]:

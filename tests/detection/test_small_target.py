@@ -10,10 +10,9 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import BackgroundDetector, SmallTargetDetector, make_detector
 from cotarget.detection.small_target import (
     CLEAR_SIGNAL,
-    EVEN,
     CameraMotion,
     History,
-    change,
+    changes,
     find_small_targets,
     small_target_score,
 )
@@ -259,11 +258,11 @@ def test_change_is_a_part_of_the_targets_own_contrast():
         after = before.copy()
         after[20:26, 30:36] = grey
         low, size, still = (30, 20), (6, 6), np.zeros(2)
-        assert change(after, low, size, 160.0, still, 0.0, (before, still)) == pytest.approx(1.0)
-        assert change(after, low, size, 160.0, still, 0.0, (after, still)) == 0.0
+        assert changes(after, low, size, 160.0, still, 0.0, [(before, still)]) == pytest.approx([1.0])
+        assert changes(after, low, size, 160.0, still, 0.0, [(after, still)]) == [0.0]
         shifted = np.roll(after, 5, axis=1)
-        assert change(shifted, (35, 20), size, 160.0, np.array([5.0, 0.0]), 0.0, (after, still)) == 0.0
-    assert change(after, low, size, 160.0, np.array([60.0, 0.0]), 0.0, (before, still)) == 0.0  # was not in view
+        assert changes(shifted, (35, 20), size, 160.0, np.array([5.0, 0.0]), 0.0, [(after, still)]) == [0.0]
+    assert changes(after, low, size, 160.0, np.array([60.0, 0.0]), 0.0, [(before, still)]) == [0.0]  # was not in view
 
 
 def test_the_pictures_noise_is_measured():
@@ -275,15 +274,16 @@ def test_the_pictures_noise_is_measured():
 
 
 def test_score_rises_with_contrast_and_change_and_neither_alone_will_do():
-    """Half at the stated balance; a clear contrast does not make up for a lack of change."""
-    usual = [0.05, 0.08, 0.15, 0.20]
-    assert small_target_score(EVEN, usual) == pytest.approx(0.5)
-    assert small_target_score(6.0, [0.9] * 4) > 0.8
-    assert small_target_score(100.0, [0.0] * 4) < 0.05
-    assert small_target_score(100.0, usual) == small_target_score(CLEAR_SIGNAL, usual)
+    """A clear contrast does not make up for a lack of change, and texture beside a target speaks against it."""
+    usual, sky, trees = [0.05, 0.08, 0.15, 0.20], 0.0, 20.0
+    assert small_target_score(6.0, [0.9] * 4, sky) > small_target_score(6.0, [0.9] * 4, trees) > 0.8
+    assert small_target_score(100.0, [0.0] * 4, sky) < 0.5
+    assert small_target_score(100.0, [0.0] * 4, trees) < 0.01
+    assert small_target_score(100.0, usual, sky) == small_target_score(CLEAR_SIGNAL, usual, sky)
     appeared = [0.0, 0.0, 1.0, 1.0]  # what has come and stands
-    assert small_target_score(CLEAR_SIGNAL, appeared) < 0.5 < small_target_score(CLEAR_SIGNAL, [0.1, 0.3, 1.0, 1.0])
-    assert small_target_score(CLEAR_SIGNAL, [float("nan")] * 4) == 0.0
+    goes_on = [0.1, 0.3, 1.0, 1.0]
+    assert small_target_score(CLEAR_SIGNAL, appeared, trees) < 0.5 < small_target_score(CLEAR_SIGNAL, goes_on, trees)
+    assert small_target_score(CLEAR_SIGNAL, [float("nan")] * 4, sky) == 0.0
 
 
 def test_frames_that_repeat_and_times_that_jump():

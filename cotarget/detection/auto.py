@@ -1,0 +1,195 @@
+"""Detect what moves or stands out, from a few pixels to half the image, without being told a kind of target.
+
+Two detectors search each image. `SmallTargetDetector` finds by contrast and change, and outlines what stands before a
+plain background to the pixel. `BackgroundDetector`, on an image of reduced size, finds large targets of many colours,
+such as people, as a whole. `fuse` makes one list of both.
+
+The score of a small target falls where something like it is seen most of the time: a twig, a swinging tape. The
+background is not learnt where the tracker follows a target, so a target that stops is found for HELD_S. Measurements:
+docs/design-notes.md.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from cotarget.detection.background import LARGE, BackgroundDetector
+from cotarget.detection.base import Detection
+from cotarget.detection.small_target import SmallTargetDetector
+from cotarget.geometry import Array
+from cotarget.rig import Frame, Image
+
+if TYPE_CHECKING:
+    from cotarget.tracking.track import Track
+
+# Least score of a small target. The tracker begins no track with so little; a target that hovers before trees keeps it.
+LEAST_SCORE = 0.005
+# Score of a large target: alone it confirms no track, but together with the track's travel.
+LARGE_SCORE = 0.3
+# In parts of the image's width: least larger side of a large target; most that a camera shakes, more is a pan; shift at
+# which the background is learnt again, because too much of it is out of view; and least shift that counts.
+LARGE_PART, SHAKE_PART, VIEW_PART, QUIET_PART = 24 / 640, 3 / 640, 0.1, 0.5 / 640
+# Time for which a camera that has moved must stand still before large targets are searched [s].
+STEADY_S = 0.2
+# Largest texture beside a target before a plain background [grey levels].
+PLAIN = 5.0
+# A small target that covers the first part of a large one is the same target; one of which the large one covers less
+# than the second part is much larger.
+SAME, MOST = 0.6, 0.4
+# Part of a small target inside a large one from which it is a part of it.
+INSIDE = 0.5
+# Time for which the background under a confirmed track is not learnt, from when the track last moved by its size [s].
+HELD_S = 60.0
+# Margin around what is held: in parts of its size, and in parts of the image's width.
+HELD_MARGIN, HELD_PART = 0.2, 2 / 640
+# Clutter: number of cells along the image's width, memory [s], and the usual score that halves a target's odds.
+CELLS, CLUTTER_S, CLUTTER_EVEN = 80, 10.0, 0.03
+
+
+class AutoDetector:
+    """Detect small targets by contrast and change, and large ones by a background model."""
+
+    def __init__(self, rate_hz: float) -> None:
+        """Start without history and background; ``rate_hz`` is the nominal frame rate [Hz]."""
+        self._small = SmallTargetDetector(LEAST_SCORE)
+        self._large = BackgroundDetector(LARGE, rate_hz)
+        self._clutter = Clutter()
+        self._width = 0
+        self._begun = np.zeros(2)  # the camera's shift when the background was begun [px]
+        self._shifts: deque[tuple[float, Array]] = deque()  # the camera's shift in the last frames [px]
+        self._moved: dict[int, tuple[float, Array]] = {}  # when a track last moved by its size, and where to
+        self._held: list[tuple[Array, Array]] = []  # centre and size of each place whose background is not learnt
+
+    @property
+    def mask(self) -> Image | None:
+        """Foreground of the background model, and boxes of small targets by their score, (H, W), 0 to 255."""
+        small, large = self._small.mask, self._large.mask
+        return small if small is None or large is None else np.asarray(cv2.max(small, large), dtype=np.uint8)
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """Detect the targets, best first.
+
+        Raises:
+            CotargetError: the image's size changed.
+        """
+        targets = self._small.find(frame)
+        width = self._width = frame.image.shape[1]
+        steady = self._register(frame.t, width)
+        small = self._clutter.weigh([detection for _, detection in targets], frame.t, width, self._held)
+        if not steady:
+            return fuse(small, [], [])
+        self._large.held = self._held
+        large = [replace(each, score=LARGE_SCORE) for each in self._large.detect(frame)]
+        outlined = [target.beside <= PLAIN for target, _ in targets]
+        return fuse(small, outlined, [each for each in large if each.size_px.max() >= LARGE_PART * width])
+
+    def _register(self, t: float, width: int) -> bool:
+        """Give the background model the camera's shift; whether the camera has stood still for STEADY_S."""
+        shift, least = self._small.shift, SHAKE_PART * width
+        self._shifts.append((t, shift))
+        while not 0 <= t - self._shifts[0][0] <= STEADY_S:
+            self._shifts.popleft()
+        off = shift - self._begun
+        if self._small.camera.jumped or np.abs(off).max() > VIEW_PART * width:
+            self._begun, off = shift, np.zeros(2)
+            self._large.forget()
+            self._clutter.forget()
+        # Less than a quarter of a pixel of the reduced image is no shift but noise.
+        self._large.shift = off if np.abs(off).max() > QUIET_PART * width else np.zeros(2)
+        return all(np.abs(shift - before).max() <= least for _, before in self._shifts)
+
+    def hold(self, tracks: Sequence["Track"]) -> None:
+        """Do not learn the background under the confirmed ones of the last image's tracks, from the next image on."""
+        margin = HELD_PART * self._width
+        moved: dict[int, tuple[float, Array]] = {}
+        self._held = []
+        for track in tracks:
+            if not track.confirmed:
+                continue
+            since, place = self._moved.get(track.id, (track.t, track.center_px))
+            if np.abs(track.center_px - place).max() > track.size_px.max() + margin:
+                since, place = track.t, track.center_px
+            moved[track.id] = since, place
+            if track.t - since <= HELD_S:
+                self._held.append((track.center_px, (1 + 2 * HELD_MARGIN) * track.size_px + 2 * margin))
+        self._moved = moved
+
+
+class Clutter:
+    """Mean score of small targets at each place, as a clutter map of radar: high where a twig sways."""
+
+    def __init__(self) -> None:
+        """Start without memory."""
+        self._usual: Array | None = None
+        self._t = 0.0
+
+    def forget(self) -> None:
+        """Start anew, after the camera has moved."""
+        self._usual = None
+
+    def weigh(
+        self, found: Sequence[Detection], t: float, width: int, held: Sequence[tuple[Array, Array]]
+    ) -> list[Detection]:
+        """Lower the scores of targets where there usually is one, and remember this image.
+
+        Args:
+            found: small targets.
+            t: time of the image [s].
+            width: width of the image [px].
+            held: centre and size of places that are no clutter, because a track is followed there [px].
+
+        Returns:
+            The targets, in their order.
+        """
+        side = width / CELLS
+        if self._usual is None:
+            self._usual, self._t = np.zeros((2 * CELLS, CELLS)), t
+        now = np.zeros_like(self._usual)
+        weighed = []
+        for each in found:
+            if not any((np.abs(each.center_px - center) < size / 2).all() for center, size in held):
+                u, v = np.clip(each.center_px / side, 0, (CELLS - 1, 2 * CELLS - 1)).astype(int).tolist()
+                nearby = now[max(0, v - 1) : v + 2, max(0, u - 1) : u + 2]
+                np.maximum(nearby, each.score, out=nearby)
+                even = each.score / (1 + self._usual[v, u] / CLUTTER_EVEN)
+                each = replace(each, score=even / (even + 1 - each.score))
+            weighed.append(each)
+        self._usual += min(1.0, max(0.0, (t - self._t) / CLUTTER_S)) * (now - self._usual)
+        self._t = t
+        return weighed
+
+
+def fuse(small: Sequence[Detection], outlined: Sequence[bool], large: Sequence[Detection]) -> list[Detection]:
+    """Make one list of small and large targets, best first.
+
+    A large target is not listed where contrast outlines it better: before a plain background, or much larger, as an
+    aeroplane whose front alone has changed. Otherwise the small targets in a large one, such as head and shoes, are
+    parts of it.
+
+    Args:
+        small: targets found by contrast.
+        outlined: whether each of these stands before a plain background.
+        large: targets found by the background model.
+    """
+    found = list(small)
+    for whole in large:
+        if any(
+            _covered(whole, each) > SAME and (plain or _covered(each, whole) < MOST)
+            for each, plain in zip(small, outlined, strict=True)
+        ):
+            continue
+        parts = [each for each in small if _covered(each, whole) > INSIDE]
+        found = [each for each in found if not any(each is part for part in parts)]
+        found.append(replace(whole, score=max([whole.score, *(part.score for part in parts)])))
+    return sorted(found, key=lambda each: -each.score)
+
+
+def _covered(one: Detection, other: Detection) -> float:
+    """Part of one detection's box that another covers."""
+    low = np.maximum(one.center_px - one.size_px / 2, other.center_px - other.size_px / 2)
+    high = np.minimum(one.center_px + one.size_px / 2, other.center_px + other.size_px / 2)
+    return float(np.maximum(high - low, 0.0).prod() / one.size_px.prod())

@@ -1,0 +1,170 @@
+"""The default detector on drawn films: any size, any shape, standing, growing, in large images, after a nudge."""
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.config import TargetProfile
+from cotarget.detection import AutoDetector, Detection, make_detector
+from cotarget.detection.auto import Clutter, fuse
+from cotarget.rig import Frame
+from cotarget.tracking.track import tracking_settings
+from cotarget.tracking.tracker import Tracker
+
+NOISE = 2.0  # grey levels, as the simulated sensor's
+TARGET = TargetProfile(1.0, "width", 100.0, "auto")
+FOUND = 0.95
+
+
+def scenery(size, rng):
+    """A sky above a rough ground, (H, W, 3)."""
+    width, height = size
+    picture = np.full((height, width, 3), 170.0)
+    ground = cv2.GaussianBlur(rng.normal(0, 1, (height - height // 3, width)), (0, 0), 2.0)
+    picture[height // 3 :] = 90 + 25 * (ground / ground.std())[..., None]
+    return picture
+
+
+def texture(width, height, rng):
+    """The surface of a target: clothes or paint of several colours, (H, W, 3)."""
+    coarse = rng.uniform(20, 235, (4, 3, 3)).astype(np.float32)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_NEAREST)
+
+
+def follow(pictures, rate, rng, detector=None):
+    """Detect and track in pictures, with noise; the confirmed tracks of each frame."""
+    detector = detector or make_detector(TARGET, rate)
+    assert isinstance(detector, AutoDetector)
+    tracker, found = None, []
+    for i, picture in enumerate(pictures):
+        image = np.clip(picture + rng.normal(0, NOISE, picture.shape), 0, 255).astype(np.uint8)
+        tracker = tracker or Tracker(tracking_settings(TARGET), image.shape[1::-1])
+        tracks = tracker.update(detector.detect(Frame(image, i / rate)), i / rate)
+        detector.hold(tracks)
+        found.append([track for track in tracks if track.confirmed])
+    return found
+
+
+def on(tracks, center, within):
+    return [track for track in tracks if np.linalg.norm(track.center_px - center) <= within]
+
+
+def moved(background, surface, places):
+    """The background with a target at each place, top-left (u, v); None for none."""
+    height, width = surface.shape[:2]
+    for place in places:
+        picture = background.copy()
+        if place is not None:
+            u, v = (round(x) for x in place)
+            picture[v : v + height, u : u + width] = surface
+        yield picture
+
+
+def test_a_person_who_stands_is_held_for_a_minute():
+    """He walks in for 4 s, stands for a minute, and is one track; the background alone would have learnt him."""
+    rng, rate = np.random.default_rng(1), 5.0
+    background, surface = scenery((320, 240), rng), texture(16, 44, rng)
+    walk = [(20 + 6 * i, 150) for i in range(20)]
+    places = [None] * 10 + walk + [walk[-1]] * round(60 * rate)
+    tracks = follow(moved(background, surface, places), rate, rng)
+    middle = np.add(walk[-1], [7.5, 21.5])
+    standing = [on(each, middle, 8) for each in tracks[30:]]
+    assert np.mean([bool(each) for each in standing]) >= FOUND
+    assert {track.id for each in standing for track in each} == {standing[0][0].id}
+    assert standing[-1][0].size_px == pytest.approx([16, 44], abs=6)
+
+
+@pytest.mark.parametrize("size", [(60, 24), (30, 30), (90, 20)], ids=["car", "dog", "boat"])
+def test_an_own_target_of_any_shape_is_found(size):
+    rng, rate = np.random.default_rng(2), 25.0
+    background, surface = scenery((640, 480), rng), texture(*size, rng)
+    places = [None] * 10 + [(40 + 4 * i, 300) for i in range(100)]
+    tracks = follow(moved(background, surface, places), rate, rng)
+    right = [
+        on(each, np.array(place) + np.array(size) / 2, 6) for each, place in zip(tracks, places, strict=True) if place
+    ]
+    assert np.mean([bool(each) for each in right[10:]]) >= FOUND
+    assert right[50][0].size_px == pytest.approx(size, rel=0.3)
+    assert len({track.id for each in right for track in each}) == 1
+
+
+def test_a_target_that_grows_from_a_speck_keeps_its_number():
+    rng, rate = np.random.default_rng(3), 25.0
+    background, lengths = scenery((640, 480), rng), np.geomspace(4, 320, 200)
+    pictures = []
+    for i, length in enumerate(lengths):
+        picture = background.copy()
+        center = 150 + i, 100 + 0.6 * i
+        axes = round(length / 2 * 16), round(length / 5 * 16)
+        cv2.ellipse(picture, [round(16 * x) for x in center], axes, 0, 0, 360, (40, 50, 60), -1, cv2.LINE_AA, 4)
+        pictures.append(picture)
+    tracks = follow(pictures, rate, rng)
+    right = [on(each, (150 + i, 100 + 0.6 * i), max(4, lengths[i] / 4)) for i, each in enumerate(tracks)]
+    assert np.mean([bool(each) for each in right[12:]]) >= FOUND
+    assert len({track.id for each in right for track in each}) == 1
+    assert right[-1][0].larger_side_px == pytest.approx(320, rel=0.2)
+
+
+def test_a_bird_of_four_pixels_is_found_in_an_image_of_3840x2160():
+    """20 grey levels over a noise of 2; frames of the sensor's noise are made of a few, shifted."""
+    rng, rate, frames = np.random.default_rng(4), 25.0, 25
+    noise = [rng.normal(0, NOISE, (2160, 3840)).astype(np.float32) for _ in range(2)]
+    detector, found = AutoDetector(rate), []
+    for i in range(frames):
+        picture = 150 + np.roll(noise[i % 2], 37 * i, axis=1)
+        u, v = 800 + 11 * i, 700 + 5 * i
+        picture[v : v + 4, u : u + 4] -= 20
+        image = cv2.merge([np.clip(picture, 0, 255).astype(np.uint8)] * 3)
+        boxes = detector.detect(Frame(image, i / rate))
+        found.append([each for each in boxes if np.linalg.norm(each.center_px - [u + 1.5, v + 1.5]) < 3])
+    scored = found[8:]
+    assert np.mean([bool(each) and each[0].score > 0.5 for each in scored]) >= 0.9
+    assert np.median([each[0].size_px.max() for each in scored if each]) <= 8
+
+
+def test_a_nudge_of_the_camera_costs_three_tenths_of_a_second():
+    rng, rate = np.random.default_rng(5), 25.0
+    background, surface = scenery((680, 480), rng), texture(24, 60, rng)
+    pictures = []
+    for i, picture in enumerate(moved(background, surface, [(60 + 3 * i, 250) for i in range(100)])):
+        pictures.append(picture[:, :640] if i < 60 else picture[:, 12:652])
+    tracks = follow(pictures, rate, rng)
+    lost = [not on(each, (60 + 3 * i + 11.5 - 12 * (i >= 60), 279.5), 8) for i, each in enumerate(tracks)]
+    assert not any(lost[30:60])
+    assert sum(lost[60:]) <= 0.3 * rate
+
+
+def detection(u, v, w, h, score):
+    return Detection(np.array([u, v], dtype=float), np.array([w, h], dtype=float), score)
+
+
+def test_parts_of_a_large_target_are_not_listed_beside_it():
+    head, shoe, other = detection(100, 60, 10, 10, 0.9), detection(98, 148, 8, 4, 0.6), detection(200, 100, 10, 10, 0.7)
+    person = detection(100, 100, 30, 100, 0.3)
+    assert [(each.size_px.tolist(), each.score) for each in fuse([head, shoe, other], [False] * 3, [person])] == [
+        ([30, 100], 0.9),
+        ([10, 10], 0.7),
+    ]
+    aeroplane, front = detection(300, 100, 120, 60, 0.8), detection(255, 100, 30, 60, 0.3)
+    assert [each.size_px.tolist() for each in fuse([aeroplane], [False], [front])] == [
+        [120, 60]
+    ]  # its front alone has changed
+    outline = detection(100, 100, 34, 104, 0.8)
+    assert [each.size_px.tolist() for each in fuse([outline], [True], [person])] == [[34, 104]]
+    assert [each.size_px.tolist() for each in fuse([outline], [False], [person])] == [[30, 100]]
+
+
+def test_what_sways_at_one_place_loses_its_score_and_what_flies_through_does_not():
+    """By hand: after 10 s the usual score is 0.6 (1 - 1/e) = 0.38, which divides the odds of 1.5 by 1 + 0.38 / 0.03. A
+    target that crosses a cell in four frames has seen itself there."""
+    clutter = Clutter()
+    twig, place = detection(400, 300, 4, 4, 0.6), (np.array([400.0, 300.0]), np.array([20.0, 20.0]))
+    for i in range(251):
+        scores = {
+            each.center_px[1]: each.score
+            for each in clutter.weigh([twig, detection(2 * i, 100, 4, 4, 0.6)], i / 25, 640, [])
+        }
+        if i == 0:
+            assert scores == {300: pytest.approx(0.6), 100: pytest.approx(0.6)}
+    assert scores == {300: pytest.approx(0.1, abs=0.01), 100: pytest.approx(0.5, abs=0.02)}
+    assert clutter.weigh([twig], 10.04, 640, [place])[0].score == 0.6  # a target is followed there
