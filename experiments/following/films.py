@@ -1,0 +1,199 @@
+"""Real films with labels: the detector beside OpenCV's MOG2 and KNN, with one tracker and every threshold.
+
+The mixtures' foreground is grouped with gaps of 3 px, and swept over its threshold and its smallest area; the detector
+is swept over the score from which a track is confirmed. Tracks and labels are matched one to one, from frame 30 on, see
+`cotarget.track_metrics`. Of each way, the best recall with at most so many false tracks a minute counts. The films are
+the labelled ones of the Drone-detection-dataset, looked for in ../shared/data beside the project, or one's own.
+"""
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from cotarget.config import DEFAULT_TARGETS, DetectorName
+from cotarget.detect_video import labelled_films
+from cotarget.detection import AutoDetector, Detection, make_detector
+from cotarget.detection.background import pieces
+from cotarget.detection.base import box_detection
+from cotarget.rig import Frame, Image
+from cotarget.track_metrics import Tracked, read_labels, score_tracks
+from cotarget.tracking.track import TrackingSettings, tracking_settings
+from cotarget.tracking.tracker import Tracker
+from cotarget.video import Film
+from experiments.engine import Count, Row, Settings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+MIXTURES = {"MOG2": cv2.createBackgroundSubtractorMOG2, "KNN": cv2.createBackgroundSubtractorKNN}
+# False tracks a minute at which the ways are compared, and by how much the detector must be ahead at the first two.
+FALSE_PER_MIN = (0.5, 5.0, 50.0)
+AHEAD = 0.05
+# Gaps that are closed in the mixtures' foreground [px].
+BRIDGE_PX = (3, 3)
+
+
+@dataclass(frozen=True)
+class FilmsSettings(Settings):
+    """Settings: folders of films with their labels, the detector, what is swept, and at most so many films as seeds."""
+
+    seeds: Count = 1000
+    folders: tuple[str, ...] = (str(DATA / "flyers"), str(DATA / "birds"))
+    detector: DetectorName = "auto"
+    scores: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99)  # from which a track is confirmed
+    thresholds: tuple[float, ...] = (9.0, 16.0, 36.0, 100.0, 400.0)  # of MOG2, in variances; KNN's is 25 times as large
+    areas_px: tuple[int, ...] = (4, 16, 64, 256)  # smallest of a component
+
+
+def needs(settings: FilmsSettings) -> str:
+    """Describe what is missing to run; empty if nothing."""
+    lacking = [folder for folder in settings.folders if not Path(folder).is_dir()]
+    return f"needs films in {lacking[0]}, which are not part of the project" if lacking else ""
+
+
+def films(settings: FilmsSettings) -> list[tuple[Path, Path]]:
+    """List the films and their labels."""
+    return [pair for folder in settings.folders for pair in labelled_films(Path(folder), Path(folder))]
+
+
+def jobs(settings: FilmsSettings) -> Sequence[int]:
+    """Give the films' numbers; one where there is no film."""
+    return range(1 if needs(settings) else min(settings.seeds, len(films(settings))))
+
+
+def one(settings: FilmsSettings, number: int) -> list[Row]:
+    """Search a film in every way; give a row for each."""
+    video, file = films(settings)[number]
+    labels = read_labels(file)
+    with Film(video) as film:
+        frames = list(film)
+        rate = film.rate_hz
+    rows: list[Row] = []
+
+    def add(way: str, threshold: float, area: int, tracks: Iterable[Tracked]) -> None:
+        score = score_tracks(tracks, labels, rate, len(frames))
+        rows.append(
+            {
+                "seed": number,
+                "film": video.stem,
+                "way": way,
+                "threshold": threshold,
+                "smallest_px": area,
+                "boxes": score.boxes,
+                "found": score.found,
+                "false_tracks": score.false_tracks,
+                "minutes": len(frames) / rate / 60,
+            }
+        )
+
+    for least, tracks in _detector(settings, frames, rate).items():
+        add(settings.detector, least, 0, tracks)
+    plain = tracking_settings(replace(DEFAULT_TARGETS["bird"], detector="mog2"))
+    for way, threshold in itertools.product(MIXTURES, settings.thresholds):
+        for area, tracks in _mixture(way, threshold, settings.areas_px, frames, plain).items():
+            add(way, threshold, area, tracks)
+    return rows
+
+
+def _detector(settings: FilmsSettings, frames: Sequence[Frame], rate_hz: float) -> dict[float, list[Tracked]]:
+    """Track what the detector finds, for each score from which a track is confirmed; the usual one holds."""
+    target = replace(DEFAULT_TARGETS["bird"], detector=settings.detector)
+    detector, usual = make_detector(target, rate_hz), tracking_settings(target)
+    size = frames[0].image.shape[1], frames[0].image.shape[0]
+    own = Tracker(usual, size)
+    trackers = {least: Tracker(replace(usual, confirm_score=least), size) for least in settings.scores}
+    tracks: dict[float, list[Tracked]] = {least: [] for least in settings.scores}
+    for index, frame in enumerate(frames):
+        found = detector.detect(frame)
+        if isinstance(detector, AutoDetector):
+            detector.hold(own.update(found, frame.t))
+        for least, tracker in trackers.items():
+            tracker.update(found, frame.t)
+            tracks[least] += _confirmed(tracker, index, frame)
+    return tracks
+
+
+def _mixture(
+    way: str, threshold: float, areas_px: Sequence[int], frames: Sequence[Frame], settings: TrackingSettings
+) -> dict[int, list[Tracked]]:
+    """Track what a mixture finds, for each smallest area [px]."""
+    model = MIXTURES[way](500, threshold if way == "MOG2" else 25 * threshold, False)
+    size = frames[0].image.shape[1], frames[0].image.shape[0]
+    trackers = {area: Tracker(settings, size) for area in areas_px}
+    tracks: dict[int, list[Tracked]] = {area: [] for area in areas_px}
+    for index, frame in enumerate(frames):
+        found = _components(np.asarray(model.apply(frame.image), dtype=np.uint8))
+        for area, tracker in trackers.items():
+            tracker.update([each for pixels, each in found if pixels >= area], frame.t)
+            tracks[area] += _confirmed(tracker, index, frame)
+    return tracks
+
+
+def _components(mask: Image) -> list[tuple[int, Detection]]:
+    """Find the components of a mask, with their numbers of pixels, the largest first."""
+    found = []
+    for x, y, w, h in pieces(mask, BRIDGE_PX):
+        inside = mask[y : y + h, x : x + w]
+        dx, dy, width, height = cv2.boundingRect(inside)
+        found.append((cv2.countNonZero(inside), box_detection(x + dx, y + dy, width, height, 0.5, mask.shape)))
+    return sorted(found, key=lambda pair: -pair[0])
+
+
+def _confirmed(tracker: Tracker, index: int, frame: Frame) -> list[Tracked]:
+    """Give the confirmed tracks of a frame as boxes."""
+    return [
+        Tracked(track.center_px, track.size_px, index, frame.t, track.id) for track in tracker.tracks if track.confirmed
+    ]
+
+
+def curves(rows: Sequence[Row]) -> dict[str, list[tuple[float, float]]]:
+    """Give false tracks a minute and recall over all films, for each setting of each way."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for way, threshold, area in dict.fromkeys((row["way"], row["threshold"], row["smallest_px"]) for row in rows):
+        mine = [r for r in rows if (r["way"], r["threshold"], r["smallest_px"]) == (way, threshold, area)]
+        boxes, hit, false, minutes = (
+            sum(row[name] for row in mine) for name in ("boxes", "found", "false_tracks", "minutes")
+        )
+        found.setdefault(way, []).append((false / minutes, hit / boxes))
+    return found
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Give the best recall of each way with at most so many false tracks a minute; 0 if it always has more."""
+    return {
+        way: {
+            f"recall at {most:g} a minute": max((recall for false, recall in points if false <= most), default=0.0)
+            for most in FALSE_PER_MIN
+        }
+        for way, points in curves(rows).items()
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """List the numbers of false tracks at which the detector is not ahead of both mixtures."""
+    ours = next(way for way in summary if way not in MIXTURES)
+    return [
+        name
+        for name in list(summary[ours])[:2]
+        if not summary[ours][name] >= max(summary[way][name] for way in MIXTURES) + AHEAD
+    ]
+
+
+def plot(rows: Sequence[Row], figure: "Figure") -> None:
+    """Recall against false tracks a minute, for each threshold and smallest area."""
+    axes = figure.subplots()
+    for way, points in curves(rows).items():
+        axes.plot(*zip(*sorted(points), strict=True), "o-" if way not in MIXTURES else ".", label=way)
+    axes.set(xscale="symlog", xlabel="false tracks a minute", ylabel="recall", ylim=(0, 1))
+    axes.legend()
+
+
+SETTINGS = FilmsSettings()
+QUICK = replace(SETTINGS, seeds=1, thresholds=(16.0,))
+COST_S = 25.0
