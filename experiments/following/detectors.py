@@ -18,7 +18,7 @@ import numpy as np
 from annotated_types import Gt, Le
 
 from cotarget.config import DetectorName, RigConfig, TargetProfile
-from cotarget.detection import Detector, make_detector
+from cotarget.detection import AutoDetector, Detector, make_detector
 from cotarget.evaluation import off_target, on_target
 from cotarget.geometry import Array
 from cotarget.metrics import BACKGROUND_S, WHOLLY_VISIBLE, false_tracks, id_switches
@@ -34,7 +34,7 @@ from experiments.following.field_scenes import field_config, five_targets_config
 from experiments.following.wide_view import WIDE
 from experiments.tables import grouped, spread
 
-DETECTORS: tuple[DetectorName, ...] = ("mog2", "motion", "speck")
+DETECTORS: tuple[DetectorName, ...] = ("mog2", "motion", "speck", "auto")
 STANDS, SHAKES = "stands", "shakes"
 MEMORY_S = 0.1  # correlation time of the shake
 COME_S = 3.0  # by then the first of five is in view with any seed, and the background was learnt [s]
@@ -79,6 +79,8 @@ class Watch:
     def see(self, frame: Frame, shift: Array, outlines: Mapping[str, Silhouette | None]) -> None:
         """Search a frame with a shift (du, dv) [px], and judge the tracks."""
         tracks = self._tracker.update(self._detector.detect(frame), frame.t)
+        if isinstance(self._detector, AutoDetector):
+            self._detector.hold(tracks)
         held = [dataclasses.replace(track, center_px=track.center_px - shift) for track in tracks]
         if frame.t < BACKGROUND_S:
             return
