@@ -177,12 +177,10 @@ def fuse(small: Sequence[Detection], outlined: Sequence[bool], large: Sequence[D
     """
     found = list(small)
     for whole in large:
-        if any(
-            _covered(whole, each) > SAME and (plain or _covered(each, whole) < MOST)
-            for each, plain in zip(small, outlined, strict=True)
-        ):
+        same = [(each, plain) for each, plain in zip(small, outlined, strict=True) if _covered(whole, each) > SAME]
+        if any(plain or _covered(each, whole) < MOST for each, plain in same):
             continue
-        parts = [each for each in small if _covered(each, whole) > INSIDE]
+        parts = [each for each in small if _covered(each, whole) > INSIDE] + [each for each, _ in same]
         found = [each for each in found if not any(each is part for part in parts)]
         found.append(replace(whole, score=max([whole.score, *(part.score for part in parts)])))
     return sorted(found, key=lambda each: -each.score)

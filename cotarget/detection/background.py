@@ -44,6 +44,7 @@ class BackgroundSettings:
         largest: largest side of a target as a part of the image's.
         flat: parts of a wide component thinner than this part of its height lie on the ground, such as the edge of a
             shadow, and are no part of the target; 0 for none.
+        rim_px: so far beside what the opening leaves, thinner foreground belongs to it: feet and rotors.
         image_px: images are halved until they are at most this wide; 0 for never. All lengths are in pixels of the
             result.
     """
@@ -62,6 +63,7 @@ class BackgroundSettings:
     widest: float
     largest: float
     flat: float
+    rim_px: int = 0
     image_px: int = 960
 
 
@@ -125,6 +127,7 @@ LARGE = replace(
     bridge_px=(1, 9),
     smallest_px=(3, 3),
     smallest_area_px=25,
+    rim_px=2,
     image_px=480,
 )
 
@@ -205,7 +208,9 @@ class BackgroundDetector:
         if self._settings.sway_px:
             mask = _outside(mask, image, self._sway())
         if self._settings.opening_px:
-            mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((self._settings.opening_px,) * 2, np.uint8))
+            opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((self._settings.opening_px,) * 2, np.uint8))
+            near = cv2.dilate(opened, np.ones((2 * self._settings.rim_px + 1,) * 2, np.uint8))
+            mask = np.asarray(cv2.bitwise_and(mask, near), dtype=np.uint8)
         if shift.any():  # what has come into view is not known
             seen = _shifted(np.full(mask.shape, FOREGROUND, np.uint8), -shift, cv2.BORDER_CONSTANT)
             mask = np.asarray(cv2.bitwise_and(mask, cv2.compare(seen, FOREGROUND, cv2.CMP_EQ)), dtype=np.uint8)
