@@ -21,7 +21,7 @@ from cotarget import backends
 from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetProfile
 from cotarget.control.selection import FirstCome
-from cotarget.detection import AutoDetector, Detector, make_detector
+from cotarget.detection import Detector, make_detector
 from cotarget.errors import ConfigError
 from cotarget.evaluation import true_calibration
 from cotarget.fusion import TargetFusion
@@ -30,7 +30,7 @@ from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
 from cotarget.tracking.track import tracking_settings
-from cotarget.tracking.tracker import Tracker
+from cotarget.tracking.tracker import Tracker, update_tracks
 from cotarget.video import Film
 from experiments.engine import Count, Row, Settings
 
@@ -79,9 +79,7 @@ class Pipeline:
         began = time.perf_counter()
         detections = self.detector.detect(frame)
         detected = time.perf_counter()
-        tracks = self.tracker.update(detections, frame.t)
-        if isinstance(self.detector, AutoDetector):
-            self.detector.hold(tracks)
+        tracks = update_tracks(self.tracker, detections, frame.t, self.detector)
         self.fusion.update_fixed(frame, tracks, self.detector.mask)
         number = self.policy.select(self.fusion.candidates(tracks, frame.t), np.zeros(2), self.limits)
         self.fusion.follow(number)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from cotarget.config import TargetProfile
-from cotarget.detection import AutoDetector, make_detector
+from cotarget.detection import make_detector
 from cotarget.drawing import draw_box, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
@@ -32,7 +32,7 @@ from cotarget.track_metrics import (
     score_tracks,
 )
 from cotarget.tracking.track import Track, tracking_settings
-from cotarget.tracking.tracker import Tracker
+from cotarget.tracking.tracker import Tracker, update_tracks
 from cotarget.video import Film, FilmWriter
 
 COLUMNS = ("frame", "t", "track", "u_px", "v_px", "width_px", "height_px", "score")
@@ -113,9 +113,8 @@ def _run(
     times = []
     with_target = 0
     for frame in film:
-        tracks = [t for t in tracker.update(detector.detect(frame), frame.t) if t.confirmed]
-        if isinstance(detector, AutoDetector):
-            detector.hold(tracks)
+        tracks = update_tracks(tracker, detector.detect(frame), frame.t, detector)
+        tracks = [track for track in tracks if track.confirmed]
         for track in tracks:
             write_row(_row(film.number, frame.t, track))
         numbers.update(track.id for track in tracks)

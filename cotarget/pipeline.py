@@ -22,7 +22,7 @@ from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome, TargetSelector
 from cotarget.control.zoom import ZoomSettings, shape_of
-from cotarget.detection import AutoDetector, Detection, Detector, make_detector
+from cotarget.detection import Detection, Detector, make_detector
 from cotarget.detection.base import flood
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices
 from cotarget.estimation import Estimate, FilterSettings
@@ -43,7 +43,7 @@ from cotarget.rig import (
 )
 from cotarget.targeting import Aim, target_implausibility
 from cotarget.tracking.track import Track, TrackingSettings, tracking_settings
-from cotarget.tracking.tracker import Tracker
+from cotarget.tracking.tracker import Tracker, update_tracks
 
 # Longest wait for a zoom frame, except for the first, and pause after a fixed frame that repeats or jumps in time [s].
 WAIT_S = 2e-3
@@ -408,9 +408,7 @@ class _Run:
         frame = self._frames.read_fixed()
         interval = min(self._frames.interval, LONGEST_INTERVAL_S)
         detections = self._detector.detect(frame)
-        tracks = self._tracker.update(detections, frame.t)
-        if isinstance(self._detector, AutoDetector):
-            self._detector.hold(tracks)
+        tracks = update_tracks(self._tracker, detections, frame.t, self._detector)
         zoom, found = self._estimate(frame, tracks)
         followed = self._select(tracks)
         outcome = self._search(tracks) if followed is None else self._follow(followed, frame.t, interval)

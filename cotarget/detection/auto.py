@@ -70,6 +70,16 @@ class AutoDetector:
         small, large = self._small.mask, self._large.mask
         return small if small is None or large is None else np.asarray(cv2.max(small, large), dtype=np.uint8)
 
+    @property
+    def shift(self) -> Array:
+        """Shift of the scene in the last image since the first (du, dv) [px], (2,)."""
+        return self._small.shift
+
+    @property
+    def cut(self) -> bool:
+        """Whether the last image shows another scene than the one before."""
+        return self._small.camera.jumped
+
     def detect(self, frame: Frame) -> list[Detection]:
         """Detect the targets, best first.
 

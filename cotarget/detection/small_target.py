@@ -241,9 +241,27 @@ def changes(
         search = min(MOST_SEARCH_PX, SEARCH_PX + round(SEARCH_PART * math.hypot(du, dv)))
         then = cv2.getRectSubPix(earlier, (w + 2 * search, h + 2 * search), (u, v), patchType=cv2.CV_32F)
         then += np.float32(level - _level(then))  # flickering light is no change
-        squared = cv2.minMaxLoc(cv2.matchTemplate(then, now, cv2.TM_SQDIFF))[0]
+        squared = _least(cv2.matchTemplate(then, now, cv2.TM_SQDIFF))
         found.append(max(0.0, squared - 2 * noise**2 * w * h) / energy)
     return found
+
+
+def _least(values: np.ndarray) -> float:
+    """Estimate the least value of a surface between its samples, with a parabola along each axis."""
+    least, _, (u, v), _ = cv2.minMaxLoc(values)
+    height, width = values.shape
+    found = least
+    if 0 < u < width - 1:
+        found -= _below(least, float(values[v, u - 1]), float(values[v, u + 1]))
+    if 0 < v < height - 1:
+        found -= _below(least, float(values[v - 1, u]), float(values[v + 1, u]))
+    return found
+
+
+def _below(least: float, before: float, after: float) -> float:
+    """How far the vertex of a parabola through three samples lies below the middle one, the least."""
+    bend = before - 2 * least + after
+    return (before - after) ** 2 / (8 * bend) if bend > 0 else 0.0
 
 
 def _level(patch: np.ndarray) -> float:

@@ -135,6 +135,14 @@ class Trail:
         while self._boxes[0][0] < t - self._span_s:
             self._boxes.popleft()
 
+    def move(self, by: Array) -> None:
+        """Move all boxes with the scene, by (du, dv) [px]."""
+        du, dv = by.tolist()
+        self._boxes = deque(
+            (t, ((left + du, right + du), (top + dv, bottom + dv)), step)
+            for t, ((left, right), (top, bottom)), step in self._boxes
+        )
+
     def travel(self) -> float:
         """Compute how far the target has moved, edge by edge [px]; 0 if it jumped.
 
@@ -210,6 +218,8 @@ class Measurement(Protocol):
         """Whether the image's border cuts the box."""
 
 
+# Time for which a confirmed track is predicted after a cut of the film, or a blow at the camera [s].
+AFTER_CUT_S = 0.3
 # Width of the images for which the settings hold [px].
 USUAL_WIDTH_PX = 640
 
@@ -366,6 +376,7 @@ class LiveTrack:
         self.missed = 0
         self.confirmed = False
         self.is_part = False  # whether it lies in a larger confirmed track
+        self.is_doubtful = False  # whether the film was cut since the last detection
         self._image_size = image_size
         self.mean_score = 0.0
         self._sizes = SizeHistory(settings.size_s)
@@ -400,6 +411,13 @@ class LiveTrack:
             axis.predict(t - self.t, self.settings.process_noise)
         self.t = t
 
+    def move(self, by: Array) -> None:
+        """Move with the scene, by (du, dv) [px], because the camera has turned."""
+        for axis, shift in zip(self._axes, by.tolist(), strict=True):
+            axis.position += shift
+        if self._trail is not None:
+            self._trail.move(by)
+
     def correct(self, detection: Measurement) -> None:
         """Correct with a detection of this track alone."""
         weight = 1 - math.exp(-(self.t - self.seen) / self.settings.score_s)
@@ -425,7 +443,8 @@ class LiveTrack:
         """Longest time without a detection before the track ends [s]."""
         if not self.confirmed:
             return self.settings.drop_s
-        return min(self.settings.lose_s, self.seen - self.born)
+        longest = AFTER_CUT_S if self.is_doubtful else self.settings.lose_s
+        return min(longest, self.seen - self.born)
 
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
         """Whether the track ends: no detection for too long, or outside the image."""
@@ -496,6 +515,7 @@ class LiveTrack:
             axis.correct(at, var)
         self.seen = self.t
         self.missed = 0
+        self.is_doubtful = False
 
 
 def missing(usual: Array, size: Array) -> Array:

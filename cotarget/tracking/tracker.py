@@ -6,6 +6,7 @@ Each track is filtered by `cotarget.tracking.track`. The source of the numbers: 
 
 import math
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -46,6 +47,7 @@ class Tracker:
         self._tracks: list[LiveTrack] = []
         self._next_id = 1
         self._t: float | None = None
+        self._shift: Array = np.zeros(2)  # of the scene in the last frame [px]
         self._interval = self._settings.lose_s  # between the last two frames [s]
 
     @property
@@ -53,7 +55,9 @@ class Tracker:
         """All tracks after the last update; confirmed ones first, then by age."""
         return sorted((s.track() for s in self._tracks), key=lambda track: (not track.confirmed, track.id))
 
-    def update(self, detections: Sequence[Measurement], t: float) -> list[Track]:
+    def update(
+        self, detections: Sequence[Measurement], t: float, shift: Array | None = None, *, cut: bool = False
+    ) -> list[Track]:
         """Update the tracks with one frame's detections.
 
         Args:
@@ -61,6 +65,9 @@ class Tracker:
                 then the best.
             t: exposure time of the frame [s]. A frame that is not newer than the last one is ignored; after a clock
                 that jumped back by more than a track lives, tracking restarts.
+            shift: shift of the scene in the image since the first frame (du, dv) [px], (2,); None for a camera that
+                stands. Tracks move with the scene.
+            cut: whether the frame shows another scene than the one before. Tracks that are not found again end soon.
 
         Returns:
             All tracks at ``t``; confirmed ones first, then by age.
@@ -70,6 +77,7 @@ class Tracker:
                 return self.tracks
             self._tracks.clear()
         self._begin(t)
+        self._follow_scene(self._shift if shift is None else shift, cut)
         detections = self._most_useful(detections)
         matches: dict[int, int] = {}
         merged: dict[int, int] = {}
@@ -104,6 +112,13 @@ class Tracker:
         if self._t is not None and t > self._t:
             self._interval = t - self._t
         self._t = t
+
+    def _follow_scene(self, shift: Array, cut: bool) -> None:
+        """Move all tracks by what the scene has moved since the last frame."""
+        by, self._shift = shift - self._shift, shift
+        for state in self._tracks:
+            state.move(by)
+            state.is_doubtful |= cut
 
     def _parts(self) -> list[bool]:
         """Whether each track lies mostly in a larger confirmed one."""
@@ -145,6 +160,37 @@ class Tracker:
                 free &= ~covers[j]
                 self._tracks.append(LiveTrack(self._next_id, detection, t, self._settings, self._image_size))
                 self._next_id += 1
+
+
+@runtime_checkable
+class Registering(Protocol):
+    """A detector that measures the camera's motion, and is told what is followed.
+
+    Attributes:
+        shift: shift of the scene in the last frame since the first (du, dv) [px], (2,).
+        cut: whether the last frame shows another scene than the one before.
+    """
+
+    @property
+    def shift(self) -> Array: ...
+
+    @property
+    def cut(self) -> bool: ...
+
+    def hold(self, tracks: Sequence[Track]) -> None:
+        """Take note of the last frame's tracks."""
+
+
+def update_tracks(tracker: Tracker, detections: Sequence[Measurement], t: float, detector: object) -> list[Track]:
+    """Update the tracks with what a detector found at time ``t`` [s]; give all tracks.
+
+    A detector that is `Registering` tells the tracker how the camera has moved, and learns what is followed.
+    """
+    if not isinstance(detector, Registering):
+        return tracker.update(detections, t)
+    tracks = tracker.update(detections, t, detector.shift, cut=detector.cut)
+    detector.hold(tracks)
+    return tracks
 
 
 class _Pairs:

@@ -18,7 +18,7 @@ import numpy as np
 from annotated_types import Gt, Le
 
 from cotarget.config import DetectorName, RigConfig, TargetProfile
-from cotarget.detection import AutoDetector, Detector, make_detector
+from cotarget.detection import Detector, make_detector
 from cotarget.evaluation import off_target, on_target
 from cotarget.geometry import Array
 from cotarget.metrics import BACKGROUND_S, WHOLLY_VISIBLE, false_tracks, id_switches
@@ -28,7 +28,7 @@ from cotarget.sim.targets.random_paths import GROUPED, SECONDS
 from cotarget.sim.truth import Silhouette
 from cotarget.sim.world import SimWorld
 from cotarget.tracking.track import tracking_settings
-from cotarget.tracking.tracker import Tracker
+from cotarget.tracking.tracker import Tracker, update_tracks
 from experiments.engine import Count, Row, Settings
 from experiments.following.field_scenes import field_config, five_targets_config
 from experiments.following.wide_view import WIDE
@@ -78,9 +78,7 @@ class Watch:
 
     def see(self, frame: Frame, shift: Array, outlines: Mapping[str, Silhouette | None]) -> None:
         """Search a frame with a shift (du, dv) [px], and judge the tracks."""
-        tracks = self._tracker.update(self._detector.detect(frame), frame.t)
-        if isinstance(self._detector, AutoDetector):
-            self._detector.hold(tracks)
+        tracks = update_tracks(self._tracker, self._detector.detect(frame), frame.t, self._detector)
         held = [dataclasses.replace(track, center_px=track.center_px - shift) for track in tracks]
         if frame.t < BACKGROUND_S:
             return

@@ -17,13 +17,13 @@ import numpy as np
 
 from cotarget.config import DEFAULT_TARGETS, DetectorName
 from cotarget.detect_video import labelled_films
-from cotarget.detection import AutoDetector, Detection, make_detector
+from cotarget.detection import Detection, make_detector
 from cotarget.detection.background import pieces
 from cotarget.detection.base import box_detection
 from cotarget.rig import Frame, Image
 from cotarget.track_metrics import Tracked, read_labels, score_tracks
 from cotarget.tracking.track import TrackingSettings, tracking_settings
-from cotarget.tracking.tracker import Tracker
+from cotarget.tracking.tracker import Registering, Tracker, update_tracks
 from cotarget.video import Film
 from experiments.engine import Count, Row, Settings
 
@@ -111,10 +111,10 @@ def _detector(settings: FilmsSettings, frames: Sequence[Frame], rate_hz: float) 
     tracks: dict[float, list[Tracked]] = {least: [] for least in settings.scores}
     for index, frame in enumerate(frames):
         found = detector.detect(frame)
-        if isinstance(detector, AutoDetector):
-            detector.hold(own.update(found, frame.t))
+        shift, cut = (detector.shift, detector.cut) if isinstance(detector, Registering) else (None, False)
+        update_tracks(own, found, frame.t, detector)
         for least, tracker in trackers.items():
-            tracker.update(found, frame.t)
+            tracker.update(found, frame.t, shift, cut=cut)
             tracks[least] += _confirmed(tracker, index, frame)
     return tracks
 
