@@ -36,6 +36,8 @@ LEAST_CORNER = 3e-4
 CORNER_BLOCK = 3
 # With fewer corners the median is no measurement, and the camera is taken to stand still.
 FEWEST = 8
+# So many that come at once are those of another scene.
+MANY = 24
 # If less than this part of the corners is found again, the film was cut or the camera was moved.
 FOUND_AGAIN = 0.3
 # Frames after which corners are detected again, because some have drifted off and some are on a target.
@@ -88,6 +90,9 @@ class CameraMotion:
             self._corners = _corners(before)
             self._age = 0
         if self._corners is None or len(self._corners) < FEWEST:
+            # A film that goes on in another place: where there was sky alone, there are many corners at once.
+            come = _corners(after)
+            self.jumped = come is not None and len(come) >= MANY
             return np.zeros(2)
         moved, found, _ = cv2.calcOpticalFlowPyrLK(
             before, after, self._corners, None, winSize=WINDOW_PX, maxLevel=LEVELS
