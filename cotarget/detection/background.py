@@ -45,6 +45,8 @@ class BackgroundSettings:
         flat: parts of a wide component thinner than this part of its height lie on the ground, such as the edge of a
             shadow, and are no part of the target; 0 for none.
         rim_px: so far beside what the opening leaves, thinner foreground belongs to it: feet and rotors.
+        ghosts: whether a place counts that stands out in the background and not in the image, because a target that
+            stood there has left.
         image_px: images are halved until they are at most this wide; 0 for never. All lengths are in pixels of the
             result.
     """
@@ -64,6 +66,7 @@ class BackgroundSettings:
     largest: float
     flat: float
     rim_px: int = 0
+    ghosts: bool = True
     image_px: int = 960
 
 
@@ -128,6 +131,7 @@ LARGE = replace(
     smallest_px=(3, 3),
     smallest_area_px=25,
     rim_px=2,
+    ghosts=False,
     image_px=480,
 )
 
@@ -230,6 +234,7 @@ class BackgroundDetector:
                 size_px=factor * each.size_px,
             )
             for each in self._boxes(mask)
+            if self._settings.ghosts or not self._is_ghost(image, mask, _rows_and_columns(each))
         ]
 
     def _subtract(self, image: Image, t: float, factor: int) -> Image:
@@ -349,6 +354,13 @@ class BackgroundDetector:
         columns = cv2.dilate(stands, np.ones((1, self._settings.bridge_px[0]), np.uint8)).any(axis=0)
         edges = np.flatnonzero(np.diff(columns, prepend=False, append=False)).tolist()
         return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def _rows_and_columns(box: Detection) -> tuple[slice, slice]:
+    """Give the part of an image that a box of whole pixels covers."""
+    first = np.rint(box.center_px - (box.size_px - 1) / 2).astype(int)
+    u, v = (slice(a, b) for a, b in zip(first, first + box.size_px.astype(int), strict=True))
+    return v, u
 
 
 def _shifted(image: Image, shift: Array, border: int = cv2.BORDER_REPLICATE) -> Image:
