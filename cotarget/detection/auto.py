@@ -165,7 +165,7 @@ class Clutter:
                 u, v = np.clip(each.center_px / side, 0, (CELLS - 1, 2 * CELLS - 1)).astype(int).tolist()
                 nearby = now[max(0, v - 1) : v + 2, max(0, u - 1) : u + 2]
                 np.maximum(nearby, each.score, out=nearby)
-                even = each.score / (1 + self._usual[v, u] / CLUTTER_EVEN)
+                even = each.score / (1 + float(self._usual[v, u]) / CLUTTER_EVEN)
                 each = replace(each, score=even / (even + 1 - each.score))
             weighed.append(each)
         self._usual += min(1.0, max(0.0, (t - self._t) / CLUTTER_S)) * (now - self._usual)

@@ -74,6 +74,10 @@ class BackgroundSettings:
 LEARNING_INTERVAL_S = 0.2
 # Interval at which the background image is read from the mixture, a third of a frame's work [s].
 BACKGROUND_UPDATE_S = 0.25
+# Half the width of a target's edge, along which a target and the place that one has left are told apart [px].
+EDGE_PX = 1
+# Largest edge in the image over that in the background, where a target has left.
+GHOST = 0.7
 # Part of foreground pixels up to which it is faster to process them one by one than the whole image.
 FEW = 0.01
 # Margin beside the background's range [grey levels]: five standard deviations of a sensor's noise of 2, and coding.
@@ -256,19 +260,19 @@ class BackgroundDetector:
         return mask
 
     def _is_ghost(self, image: Image, mask: Image, box: tuple[slice, slice]) -> bool:
-        """Whether the foreground in a box stands out from its surroundings in the background and not in the image.
+        """Whether the edge of the foreground in a box is an edge of the background and not of the image.
 
         A target that stood there when the background was learnt, and has left, leaves such a place.
         """
-        inside = mask[box]
-        if not 0 < cv2.countNonZero(inside) < inside.size:
-            return False
-        outside = cv2.bitwise_not(inside)
+        rows, columns = (slice(max(0, each.start - EDGE_PX), each.stop + EDGE_PX) for each in box)
+        box = rows, columns
+        nearby = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
+        edge = cv2.morphologyEx(mask[box], cv2.MORPH_GRADIENT, nearby)
         now, before = (
-            np.linalg.norm(np.subtract(cv2.mean(each[box], inside), cv2.mean(each[box], outside)))
+            sum(cv2.mean(cv2.morphologyEx(each[box], cv2.MORPH_GRADIENT, nearby), edge))
             for each in (image, self._background())
         )
-        return bool(now < before)
+        return now < GHOST * before
 
     def forget(self) -> None:
         """Learn the background again from the next image on."""

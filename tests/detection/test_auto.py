@@ -9,7 +9,7 @@ from cotarget.detection import AutoDetector, Detection, make_detector
 from cotarget.detection.auto import Clutter, fuse
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
-from cotarget.tracking.tracker import Tracker
+from cotarget.tracking.tracker import Tracker, update_tracks
 
 NOISE = 2.0  # grey levels, as the simulated sensor's
 TARGET = TargetProfile(1.0, "width", 100.0, "auto")
@@ -39,8 +39,7 @@ def follow(pictures, rate, rng, detector=None):
     for i, picture in enumerate(pictures):
         image = np.clip(picture + rng.normal(0, NOISE, picture.shape), 0, 255).astype(np.uint8)
         tracker = tracker or Tracker(tracking_settings(TARGET), image.shape[1::-1])
-        tracks = tracker.update(detector.detect(Frame(image, i / rate)), i / rate)
-        detector.hold(tracks)
+        tracks = update_tracks(tracker, detector.detect(Frame(image, i / rate)), i / rate, detector)
         found.append([track for track in tracks if track.confirmed])
     return found
 
@@ -168,3 +167,13 @@ def test_what_sways_at_one_place_loses_its_score_and_what_flies_through_does_not
             assert scores == {300: pytest.approx(0.6), 100: pytest.approx(0.6)}
     assert scores == {300: pytest.approx(0.1, abs=0.01), 100: pytest.approx(0.5, abs=0.02)}
     assert clutter.weigh([twig], 10.04, 640, [place])[0].score == 0.6  # a target is followed there
+
+
+def test_the_place_that_a_target_has_left_is_no_target():
+    """A car stood there when the background was learnt; it drives off, and leaves a ghost in the background model."""
+    rng, rate = np.random.default_rng(6), 25.0
+    background, surface = scenery((640, 480), rng), texture(60, 24, rng)
+    places = [(100, 300)] * 50 + [(100 + 6 * i, 300) for i in range(80)]
+    tracks = follow(moved(background, surface, places), rate, rng)
+    assert all(on(each, np.add(place, [29.5, 11.5]), 6) for each, place in zip(tracks[75:], places[75:], strict=True))
+    assert not any(on(each, (129.5, 311.5), 20) for each in tracks[75:])

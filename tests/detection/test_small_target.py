@@ -226,6 +226,10 @@ def test_a_cut_is_noticed_and_a_sky_without_corners_stands():
         shift = camera.update(np.full((HEIGHT, WIDTH), 180, np.uint8))
     assert shift.tolist() == [0, 0]
     assert not camera.jumped
+    for jumped in (True, False):  # the film goes on elsewhere
+        picture = photograph(landscape(np.random.default_rng(6)), rng)
+        camera.update(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+        assert camera.jumped == jumped
 
 
 def test_a_bird_alone_in_the_sky_is_not_taken_for_the_cameras_motion():
@@ -263,6 +267,18 @@ def test_change_is_a_part_of_the_targets_own_contrast():
         shifted = np.roll(after, 5, axis=1)
         assert changes(shifted, (35, 20), size, 160.0, np.array([5.0, 0.0]), 0.0, [(after, still)]) == [0.0]
     assert changes(after, low, size, 160.0, np.array([60.0, 0.0]), 0.0, [(before, still)]) == [0.0]  # was not in view
+
+
+def test_a_shift_between_two_pixels_is_no_change():
+    """A blurred pole, a third of a pixel beside where the camera's shift would have it."""
+    u = np.arange(80.0)
+
+    def pole(at):
+        return np.tile(160 - 100 * np.exp(-(((u - at) / 2) ** 2)), (60, 1)).round().astype(np.uint8)
+
+    still = np.zeros(2)
+    change = changes(pole(40.3), (36, 20), (9, 20), 160.0, still, 0.0, [(pole(40.0), still)])
+    assert change == pytest.approx([0.0], abs=0.01)
 
 
 def test_the_pictures_noise_is_measured():

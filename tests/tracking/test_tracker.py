@@ -381,3 +381,47 @@ def test_other_targets_far_away_change_nothing(name):
         states = [[(track.missed, *track.center_px) for track in tracks if track.center_px[1] < 400]
                   for tracks in (one, two)]  # fmt: skip
         assert sorted(states[0]) == sorted(states[1])
+
+
+# A camera that moves
+
+
+def test_tracks_move_with_the_scene():
+    """The camera turns by 4 px a frame and loses the target for 0.6 s: it is found again where it now is."""
+    tracker, times, turn = Tracker(PLAIN, SIZE), np.arange(40) / RATE, np.array([4.0, -1.0])
+    for i, t in enumerate(times):
+        shift = np.maximum(i - 24, 0) * turn
+        at = np.array([200.0, 300.0]) + shift
+        tracks = tracker.update([seen(*at)] if i <= 24 else [], t, shift)
+    (track,) = tracks
+    assert track.center_px == pytest.approx(at, abs=1e-6)
+    assert track.velocity_px == pytest.approx([0.0, 0.0], abs=1e-6)  # relative to the scene
+    (same,) = tracker.update([seen(*(at + turn))], times[-1] + 1 / RATE, shift + turn)
+    assert (same.id, same.missed) == (track.id, 0)
+
+
+def test_what_stands_has_not_travelled_when_the_camera_turns():
+    moving = replace(PLAIN, confirm_travel=0.5)
+    for follows in (True, False):
+        tracker = Tracker(moving, SIZE)
+        for i in range(40):
+            shift = np.array([3.0 * i, 0.0])
+            tracks = tracker.update([seen(*(np.array([100.0, 300.0]) + shift))], i / RATE, shift if follows else None)
+        assert [track.confirmed for track in tracks] == [not follows]
+
+
+@pytest.mark.parametrize("cut", [True, False])
+def test_after_a_cut_a_track_that_is_not_found_again_soon_ends(cut):
+    tracker, t = Tracker(PLAIN, SIZE), 0.0
+    flown(tracker, velocity=(20.0, 0.0))
+    for i in range(1, 11):
+        t = 1.0 + i / RATE
+        tracks = tracker.update([], t, cut=cut and i == 1)
+    assert len(tracks) == (0 if cut else 1)
+
+
+def test_a_track_that_is_found_after_a_cut_lives_as_long_as_any():
+    tracker = Tracker(PLAIN, SIZE)
+    place, _ = flown(tracker, velocity=(0.0, 0.0))
+    tracker.update([seen(*place)], 1.0, cut=True)
+    assert len(tracker.update([], 1.6)) == 1
