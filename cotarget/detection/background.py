@@ -45,8 +45,7 @@ class BackgroundSettings:
         flat: parts of a wide component thinner than this part of its height lie on the ground, such as the edge of a
             shadow, and are no part of the target; 0 for none.
         rim_px: so far beside what the opening leaves, thinner foreground belongs to it: feet and rotors.
-        ghosts: whether a place counts that stands out in the background and not in the image, because a target that
-            stood there has left.
+        edged: whether a target must have a sharp edge in the image, unlike a cloud or the place that one has left.
         image_px: images are halved until they are at most this wide; 0 for never. All lengths are in pixels of the
             result.
     """
@@ -66,7 +65,7 @@ class BackgroundSettings:
     largest: float
     flat: float
     rim_px: int = 0
-    ghosts: bool = True
+    edged: bool = False
     image_px: int = 960
 
 
@@ -76,6 +75,9 @@ LEARNING_INTERVAL_S = 0.2
 BACKGROUND_UPDATE_S = 0.25
 # Half the width of a target's edge, along which a target and the place that one has left are told apart [px].
 EDGE_PX = 1
+# Width of the edge from which it is that of a cloud [px], the part of foreground with less difference to the background
+# than counts, and the part of a box with less slope: the edge is as wide as that difference over that slope.
+SOFT_PX, CONTRAST_PART, SLOPE_PART = 4.0, 0.9, 0.98
 # Largest edge in the image over that in the background, where a target has left.
 GHOST = 0.7
 # Part of foreground pixels up to which it is faster to process them one by one than the whole image.
@@ -135,7 +137,7 @@ LARGE = replace(
     smallest_px=(3, 3),
     smallest_area_px=25,
     rim_px=2,
-    ghosts=False,
+    edged=True,
     image_px=480,
 )
 
@@ -238,7 +240,7 @@ class BackgroundDetector:
                 size_px=factor * each.size_px,
             )
             for each in self._boxes(mask)
-            if self._settings.ghosts or not self._is_ghost(image, mask, _rows_and_columns(each))
+            if not self._settings.edged or self._has_edge(image, mask, _rows_and_columns(each))
         ]
 
     def _subtract(self, image: Image, t: float, factor: int) -> Image:
@@ -273,6 +275,16 @@ class BackgroundDetector:
             for each in (image, self._background())
         )
         return now < GHOST * before
+
+    def _has_edge(self, image: Image, mask: Image, box: tuple[slice, slice]) -> bool:
+        """Whether the foreground in a box has a sharp edge, and not only because it has one in the background."""
+        now, before = (
+            cv2.cvtColor(each[box], cv2.COLOR_BGR2GRAY).astype(np.float32) for each in (image, self._background())
+        )
+        difference = now - before
+        contrast = np.quantile(np.abs(difference[mask[box] != 0]), CONTRAST_PART)
+        slopes = cv2.magnitude(*(cv2.Sobel(difference, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (0, 1)))
+        return contrast < SOFT_PX * np.quantile(slopes, SLOPE_PART) and not self._is_ghost(image, mask, box)
 
     def forget(self) -> None:
         """Learn the background again from the next image on."""

@@ -177,3 +177,17 @@ def test_the_place_that_a_target_has_left_is_no_target():
     tracks = follow(moved(background, surface, places), rate, rng)
     assert all(on(each, np.add(place, [29.5, 11.5]), 6) for each, place in zip(tracks[75:], places[75:], strict=True))
     assert not any(on(each, (129.5, 311.5), 20) for each in tracks[75:])
+
+
+@pytest.mark.parametrize("soft", [True, False], ids=["cloud", "balloon"])
+def test_a_cloud_that_drifts_is_no_target(soft):
+    """Both are some 50 px large and 30 grey levels brighter than the sky."""
+    rng, rate = np.random.default_rng(7), 25.0
+    background, (v, u) = scenery((640, 480), rng), np.mgrid[:480, :640]
+    pictures = []
+    for i in range(80):
+        square = ((u - 150 - 2 * i) / 16) ** 2 + ((v - 90) / 13) ** 2
+        shape = np.exp(-square / 2) if soft else square < 2
+        pictures.append(background + 30.0 * min(1.0, i / 10) * shape[..., None])
+    tracks = follow(pictures, rate, rng)
+    assert any(tracks) != soft
