@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 MIXTURES = {"MOG2": cv2.createBackgroundSubtractorMOG2, "KNN": cv2.createBackgroundSubtractorKNN}
-# Flyers of these films that have no label, found by looking at every false track: a box about every fifth frame. Each is
+# Flyers of these films that have no label, found by looking at every false track: a box about every fifth frame. One is
 # listed while it is seen to fly, not where it is lost among twigs.
 UNLABELLED = Path(__file__).with_name("unlabelled_flyers.csv")
 # False tracks a minute at which the ways are compared, and by how much the detector must be ahead at the first two.
