@@ -268,6 +268,8 @@ class BackgroundDetector:
         """
         rows, columns = (slice(max(0, each.start - EDGE_PX), each.stop + EDGE_PX) for each in box)
         box = rows, columns
+        if not mask[box].any():
+            return False
         nearby = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
         edge = cv2.morphologyEx(mask[box], cv2.MORPH_GRADIENT, nearby)
         now, before = (

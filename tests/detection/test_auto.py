@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from cotarget.config import TargetProfile
-from cotarget.detection import AutoDetector, Detection, make_detector
+from cotarget.detection import AutoDetector, BackgroundDetector, Detection, make_detector
 from cotarget.detection.auto import Clutter, fuse
+from cotarget.detection.background import LARGE
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker, update_tracks
@@ -191,3 +192,13 @@ def test_a_cloud_that_drifts_is_no_target(soft):
         pictures.append(background + 30.0 * min(1.0, i / 10) * shape[..., None])
     tracks = follow(pictures, rate, rng)
     assert any(tracks) != soft
+
+
+def test_a_place_that_is_held_may_lie_outside_the_image():
+    """A track near the border, and a camera that has been nudged."""
+    rng, rate = np.random.default_rng(8), 25.0
+    detector = BackgroundDetector(LARGE, rate)
+    detector.held = [(np.array([u, 100.0]), np.array([10.0, 10.0])) for u in (-300.0, 700.0)]
+    picture = scenery((640, 480), rng)
+    for i in range(20):
+        assert detector.detect(Frame(picture.astype(np.uint8), i / rate)) == []
