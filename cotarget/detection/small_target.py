@@ -288,6 +288,9 @@ REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES_OF_DIFFERENCE, 2**SCALES_OF_DIF
 SLOPING_SCALE = 2
 # Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
 LEAST_ROUGHNESS = 1.5
+# Window for targets of one or two pixels, which fade in a larger mean, and how many times as much the roughness of the
+# surroundings counts there: leaves and grass have such spots, a sky has none.
+PAIR_PX, PAIR_TIMES = (2, 2), 2.0
 # How far beside a target other texture counts: in parts of its larger side, and in pixels of the texture.
 BESIDE, BESIDE_PX = 2.0, 6.0
 # Part of the contrast at which a target's outline lies.
@@ -353,7 +356,8 @@ def find_small_targets(
             break
         levels.append(cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         above = levels[scale - 1] if scale == first and first else None
-        peaks += _peaks(level, levels[-1], scale, scale - first >= SLOPING_SCALE, threshold, most, above)
+        sloping, finest = scale - first >= SLOPING_SCALE, scale == 0 and not of_difference
+        peaks += _peaks(level, levels[-1], scale, sloping, threshold, most, above, finest)
         if scale - first > LARGE_SCALE and texture is not None:
             texture = cv2.resize(texture, level.shape[::-1], interpolation=cv2.INTER_AREA)
             peaks += _textured(texture, levels[-1], scale, threshold, most)
@@ -404,8 +408,25 @@ class _Peak:
     around: float
 
 
+def _limits(mean: Array, deviation: Array, threshold: float, size: tuple[int, int]) -> tuple[Image, Image]:
+    """Grey levels beyond which a pixel stands out, in an image of a size (width, height) [px].
+
+    In bytes, which is three times as fast; half a grey level is little beside ``threshold`` deviations.
+    """
+    margin = deviation * np.float32(threshold)
+    low, high = cv2.subtract(mean, margin, dtype=cv2.CV_8U), cv2.add(mean, margin, dtype=cv2.CV_8U)
+    return np.asarray(cv2.resize(low, size), dtype=np.uint8), np.asarray(cv2.resize(high, size), dtype=np.uint8)
+
+
 def _peaks(
-    level: Image, half: Image, scale: int, sloping: bool, threshold: float, most: int, finer: Image | None = None
+    level: Image,
+    half: Image,
+    scale: int,
+    sloping: bool,
+    threshold: float,
+    most: int,
+    finer: Image | None = None,
+    finest: bool = False,
 ) -> list[_Peak]:
     """Find peaks of contrast at one scale, the strongest first.
 
@@ -418,13 +439,11 @@ def _peaks(
         most: most peaks.
         finer: image of twice the size in which the contrast is searched, because a target of four pixels fades in the
             mean; None to search this one.
+        finest: whether targets of one or two pixels are searched too, where the surroundings are plain.
     """
     mean, deviation = _ring(half, sloping)
-    margin = deviation * np.float32(threshold)
     size = (level.shape[1], level.shape[0])
-    # In bytes, which is three times as fast; half a grey level is little beside `threshold` deviations.
-    low = cv2.resize(cv2.subtract(mean, margin, dtype=cv2.CV_8U), size)
-    high = cv2.resize(cv2.add(mean, margin, dtype=cv2.CV_8U), size)
+    low, high = _limits(mean, deviation, threshold, size)
     dark = bright = cv2.boxFilter(level if finer is None else finer, -1, (INNER_PX, INNER_PX))
     if finer is not None:
         pair = np.ones((2, 2), np.uint8)
@@ -432,6 +451,12 @@ def _peaks(
             cv2.resize(of(dark, pair), size, interpolation=cv2.INTER_NEAREST) for of in (cv2.erode, cv2.dilate)
         )
     off = cv2.max(cv2.subtract(low, dark), cv2.subtract(bright, high))
+    pair, rougher = level, deviation
+    if finest:
+        pair = cv2.boxFilter(level, -1, PAIR_PX)
+        rougher = deviation * np.float32(PAIR_TIMES) - np.float32((PAIR_TIMES - 1) * LEAST_ROUGHNESS)
+        low, high = _limits(mean, rougher, threshold, size)
+        off = cv2.max(off, cv2.max(cv2.subtract(low, pair), cv2.subtract(pair, high)))
     mask = cv2.compare(off, 0, cv2.CMP_GT)
     peaks = []
     for contour in cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
@@ -443,7 +468,10 @@ def _peaks(
         at = (min(v // 2, half.shape[0] - 1), min(u // 2, half.shape[1] - 1))
         around, rough = float(mean[at]), float(deviation[at])
         contrast = max(float(bright[v, u]) - around, around - float(dark[v, u]))
-        peaks.append(_Peak(u, v, scale, contrast / rough, around))
+        signal = contrast / rough
+        if finest:
+            signal = max(signal, abs(float(pair[v, u]) - around) / float(rougher[at]))
+        peaks.append(_Peak(u, v, scale, signal, around))
     peaks.sort(key=lambda peak: -peak.signal)
     return peaks[:most]
 
