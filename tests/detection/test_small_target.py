@@ -107,6 +107,20 @@ def test_small_targets_of_all_sizes_are_found_where_they_are(size):
         assert -0.1 * size - 1 <= box.size_px[0] - size <= 2.5
 
 
+def test_a_bird_of_one_pixel_before_a_plain_sky_is_found():
+    """50 grey levels darker, over a noise of 2; the mean of three by three pixels shows a tenth of that."""
+
+    def paint(picture, i):
+        picture[40 + i // 2, 50 + 2 * i] -= 50
+
+    found = watch(film(40, paint))[15:]
+    near = [
+        [box for box in boxes if np.abs(box.center_px - (50 + 2 * i, 40 + i // 2)).max() <= 1.5 and box.score > 0.5]
+        for i, boxes in enumerate(found, start=15)
+    ]
+    assert np.mean([bool(each) for each in near]) >= 0.9
+
+
 @pytest.mark.parametrize(("length", "step"), [(12, 1), (12, 2), (24, 2), (24, 4), (40, 3)])
 def test_all_of_a_plain_bird_is_boxed_though_only_its_front_is_new(length, step):
     """It moves by less than its own length in the shortest time over which pictures are compared."""
