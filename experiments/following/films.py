@@ -23,7 +23,7 @@ from cotarget.detection.base import box_detection
 from cotarget.files import read_table
 from cotarget.rig import Frame, Image
 from cotarget.track_metrics import Box, Tracked, off_boxes, read_labels, score_tracks
-from cotarget.tracking.track import TrackingSettings, tracking_settings
+from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Registering, Tracker, update_tracks
 from cotarget.video import Film
 from experiments.engine import Count, Row, Settings
@@ -98,11 +98,10 @@ def one(settings: FilmsSettings, number: int) -> list[Row]:
             }
         )
 
-    for least, tracks in _detector(settings, frames, rate).items():
+    for least, tracks in detector_tracks(settings.detector, settings.scores, frames, rate).items():
         add(settings.detector, least, 0, tracks)
-    plain = tracking_settings(replace(DEFAULT_TARGETS["bird"], detector="mog2"))
     for way, threshold in itertools.product(MIXTURES, settings.thresholds):
-        for area, tracks in _mixture(way, threshold, settings.areas_px, frames, plain).items():
+        for area, tracks in mixture_tracks(way, threshold, settings.areas_px, frames).items():
             add(way, threshold, area, tracks)
     return rows
 
@@ -122,14 +121,16 @@ def unlabelled_flyers(film: str) -> dict[int, list[Box]]:
     return found
 
 
-def _detector(settings: FilmsSettings, frames: Sequence[Frame], rate_hz: float) -> dict[float, list[Tracked]]:
-    """Track what the detector finds, for each score from which a track is confirmed; the usual one holds."""
-    target = replace(DEFAULT_TARGETS["bird"], detector=settings.detector)
+def detector_tracks(
+    name: DetectorName, scores: Sequence[float], frames: Sequence[Frame], rate_hz: float
+) -> dict[float, list[Tracked]]:
+    """Track what a detector finds, for each score from which a track is confirmed; the usual one holds."""
+    target = replace(DEFAULT_TARGETS["bird"], detector=name)
     detector, usual = make_detector(target, rate_hz), tracking_settings(target)
     size = frames[0].image.shape[1], frames[0].image.shape[0]
     own = Tracker(usual, size)
-    trackers = {least: Tracker(replace(usual, confirm_score=least), size) for least in settings.scores}
-    tracks: dict[float, list[Tracked]] = {least: [] for least in settings.scores}
+    trackers = {least: Tracker(replace(usual, confirm_score=least), size) for least in scores}
+    tracks: dict[float, list[Tracked]] = {least: [] for least in scores}
     for index, frame in enumerate(frames):
         found = detector.detect(frame)
         shift, cut = (detector.shift, detector.cut) if isinstance(detector, Registering) else (None, False)
@@ -140,11 +141,15 @@ def _detector(settings: FilmsSettings, frames: Sequence[Frame], rate_hz: float) 
     return tracks
 
 
-def _mixture(
-    way: str, threshold: float, areas_px: Sequence[int], frames: Sequence[Frame], settings: TrackingSettings
+def mixture_tracks(
+    way: str, threshold: float, areas_px: Sequence[int], frames: Sequence[Frame]
 ) -> dict[int, list[Tracked]]:
-    """Track what a mixture finds, for each smallest area [px]."""
+    """Track what a mixture finds at a threshold of MOG2 [variances], for each smallest area [px].
+
+    KNN's threshold is 25 times as large.
+    """
     model = MIXTURES[way](500, threshold if way == "MOG2" else 25 * threshold, False)
+    settings = tracking_settings(replace(DEFAULT_TARGETS["bird"], detector="mog2"))
     size = frames[0].image.shape[1], frames[0].image.shape[0]
     trackers = {area: Tracker(settings, size) for area in areas_px}
     tracks: dict[int, list[Tracked]] = {area: [] for area in areas_px}
