@@ -28,7 +28,7 @@ from cotarget.fusion import TargetFusion
 from cotarget.rig import Frame, PanTiltLimits
 from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
-from cotarget.targeting import Reach, aim
+from cotarget.targeting import Aim, Reach, aim
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker, update_tracks
 from cotarget.video import Film
@@ -73,6 +73,7 @@ class Pipeline:
         pan, tilt = spec.head.limits.pan, spec.head.limits.tilt
         self.reach = Reach(pan, tilt, spec.zoom.focal_range)
         self.limits = PanTiltLimits(pan, tilt, math.inf, math.inf, 0.0)
+        self.aim: Aim | None = None  # the last one
 
     def __call__(self, frame: Frame) -> Row:
         """Process a frame; give the milliseconds of each stage, and whether there was a target to aim at."""
@@ -86,7 +87,7 @@ class Pipeline:
         estimate = None if number is None else self.fusion.estimate(number, frame.t + LEAD_S)
         tracked = time.perf_counter()
         if estimate is not None:
-            aim(self.calibration, estimate.x_fixed, self.reach, wanted_size=estimate.wanted_size)
+            self.aim = aim(self.calibration, estimate.x_fixed, self.reach, wanted_size=estimate.wanted_size)
         ended = time.perf_counter()
         times = (began, detected, tracked, ended)
         stages = {name: 1e3 * (b - a) for name, a, b in zip(STAGES, times[:-1], times[1:], strict=True)}
