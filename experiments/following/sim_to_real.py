@@ -1,10 +1,10 @@
-"""How far the simulation is from film: recall and centre error of the same detectors in both, in strata fixed before.
+"""How far the simulation is from film: recall and centre error of detectors in both, by stratum.
 
 "auto", MOG2 and KNN, with one tracker and one setting each, run on four kinds of film:
 
 - real: the labelled films of `experiments.following.films`;
-- fitted: the same, each label replaced by a tight box around what contrasts in it, because the published boxes are up
-  to seven times as large as the target; a label in which nothing contrasts is dropped;
+- fitted: the same, with a tight box around what contrasts in each label, because published boxes are up to seven times
+  as large as the target; a label in which nothing contrasts is dropped;
 - composite: the same films with made flyers drawn far from the labels, whose boxes are exact;
 - simulation: five simulated birds in the field of `experiments.following.field_scenes`, with true boxes.
 
@@ -81,7 +81,7 @@ ERROR_WITHIN_PX = 0.3
 class SimToRealSettings(Settings):
     """Settings: at most so many films of each kind as seeds, folders of films with labels, and most frames of each."""
 
-    seeds: Count = 1000
+    seeds: Count = 20
     folders: tuple[str, ...] = films.SETTINGS.folders
     frames: Count = 300
 
