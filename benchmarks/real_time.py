@@ -68,7 +68,8 @@ def serve(pipe: Connection, frames: int, sent: Any) -> None:
     Args:
         pipe: to the other process; gets the addresses of camera and head.
         frames: number of frames to send.
-        sent: gets the time at which each frame from 1 on was published [s]; the first value is set when to begin.
+        sent: gets the time at which each frame from 1 on was published [s], infinite before; the first value is set
+            when to begin.
     """
     sys.setswitchinterval(5e-4)  # as in `cotarget emulate`
     images = [frame.image for frame, _ in film(STREAM, LENGTH, 0)]
@@ -111,7 +112,8 @@ def one(settings: RealTimeSettings, seed: int) -> list[Row]:
 
 
 def _stream(settings: RealTimeSettings, seed: int) -> list[Row]:
-    sent = multiprocessing.get_context("spawn").Array("d", settings.frames + 1, lock=False)
+    times = [0.0, *[np.inf] * settings.frames]
+    sent = multiprocessing.get_context("spawn").Array("d", times, lock=False)
     ages: dict[int, float] = {}
     clock, pipeline = MonotonicClock(), Pipeline(settings.detector, STREAM, RATE_HZ)
     with beside(serve, settings.frames, sent) as (url, port):
@@ -126,7 +128,7 @@ def _stream(settings: RealTimeSettings, seed: int) -> list[Row]:
                     t = frame.t
                     if pipeline(frame)["aimed"] and pipeline.aim is not None:
                         head.move(pipeline.aim.pan, pipeline.aim.tilt)
-                    index = int(np.searchsorted(np.array(sent)[: settings.frames + 1], t, side="right")) - 1
+                    index = int(np.searchsorted(np.array(sent), t, side="right")) - 1
                     ages[index] = clock.now() - sent[index]
     return [
         {"seed": seed, "part": "stream", "frame": index, "age_ms": 1e3 * ages[index] if index in ages else None}
