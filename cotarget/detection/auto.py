@@ -40,6 +40,9 @@ PLAIN = 5.0
 # A small target that covers the first part of a large one is the same target; one of which the large one covers less
 # than the second part is much larger.
 SAME, MOST = 0.6, 0.4
+# A small target is followed by a track if their larger sides differ by less than the first factor. Inside a large one
+# of more than so many times its area it is then another target, such as a bird before a cloud.
+ALIKE, MUCH = 2.0, 4.0
 # Part of a small target inside a large one from which it is a part of it.
 INSIDE = 0.5
 # Time for which the background under a confirmed track is not learnt, from when the track last moved by its size [s].
@@ -62,6 +65,7 @@ class AutoDetector:
         self._begun = np.zeros(2)  # the camera's shift when the background was begun [px]
         self._shifts: deque[tuple[float, Array]] = deque()  # the camera's shift in the last frames [px]
         self._moved: dict[int, tuple[float, Array]] = {}  # when a track last moved by its size, and where to
+        self._followed: list[tuple[Array, Array]] = []  # centre and size of each confirmed track
         self._held: list[tuple[Array, Array]] = []  # centre and size of each place whose background is not learnt
 
     @property
@@ -91,11 +95,12 @@ class AutoDetector:
         steady = self._register(frame.t, width)
         small = self._clutter.weigh([detection for _, detection in targets], frame.t, width, self._held)
         if not steady:
-            return fuse(small, [], [])
+            return sorted(small, key=lambda each: -each.score)
         self._large.held = self._held
         large = [replace(each, score=LARGE_SCORE) for each in self._large.detect(frame)]
         outlined = [target.beside <= PLAIN for target, _ in targets]
-        return fuse(small, outlined, [each for each in large if each.size_px.max() >= LARGE_PART * width])
+        followed = [self._is_followed(each) for each in small]
+        return fuse(small, outlined, followed, [each for each in large if each.size_px.max() >= LARGE_PART * width])
 
     def _register(self, t: float, width: int) -> bool:
         """Give the background model the camera's shift; whether the camera has stood still for STEADY_S."""
@@ -112,11 +117,20 @@ class AutoDetector:
         self._large.shift = off if np.abs(off).max() > QUIET_PART * width else np.zeros(2)
         return all(np.abs(shift - before).max() <= least for _, before in self._shifts)
 
+    def _is_followed(self, each: Detection) -> bool:
+        """Whether a confirmed track of its size follows a small target."""
+        return any(
+            (np.abs(each.center_px - center) < size / 2 + HELD_PART * self._width).all()
+            and 1 / ALIKE < each.size_px.max() / size.max() < ALIKE
+            for center, size in self._followed
+        )
+
     def hold(self, tracks: Sequence["Track"]) -> None:
         """Do not learn the background under the confirmed ones of the last image's tracks, from the next image on."""
         margin = HELD_PART * self._width
         moved: dict[int, tuple[float, Array]] = {}
         self._held = []
+        self._followed = [(track.center_px, track.size_px) for track in tracks if track.confirmed]
         for track in tracks:
             if not track.confirmed:
                 continue
@@ -173,16 +187,19 @@ class Clutter:
         return weighed
 
 
-def fuse(small: Sequence[Detection], outlined: Sequence[bool], large: Sequence[Detection]) -> list[Detection]:
+def fuse(
+    small: Sequence[Detection], outlined: Sequence[bool], followed: Sequence[bool], large: Sequence[Detection]
+) -> list[Detection]:
     """Make one list of small and large targets, best first.
 
     A large target is not listed where contrast outlines it better: before a plain background, or much larger, as an
     aeroplane whose front alone has changed. Otherwise the small targets in a large one, such as head and shoes, are
-    parts of it.
+    parts of it, unless a track has followed one of them for itself.
 
     Args:
         small: targets found by contrast.
         outlined: whether each of these stands before a plain background.
+        followed: whether a confirmed track of its size follows it.
         large: targets found by the background model.
     """
     found = list(small)
@@ -190,7 +207,12 @@ def fuse(small: Sequence[Detection], outlined: Sequence[bool], large: Sequence[D
         same = [(each, plain) for each, plain in zip(small, outlined, strict=True) if _covered(whole, each) > SAME]
         if any(plain or _covered(each, whole) < MOST for each, plain in same):
             continue
-        parts = [each for each in small if _covered(each, whole) > INSIDE] + [each for each, _ in same]
+        parts = [
+            each
+            for each, own in zip(small, followed, strict=True)
+            if (_covered(each, whole) > INSIDE or _covered(whole, each) > SAME)
+            and not (own and MUCH * each.size_px.prod() < whole.size_px.prod())
+        ]
         found = [each for each in found if not any(each is part for part in parts)]
         found.append(replace(whole, score=max([whole.score, *(part.score for part in parts)])))
     return sorted(found, key=lambda each: -each.score)

@@ -141,17 +141,21 @@ def detection(u, v, w, h, score):
 def test_parts_of_a_large_target_are_not_listed_beside_it():
     head, shoe, other = detection(100, 60, 10, 10, 0.9), detection(98, 148, 8, 4, 0.6), detection(200, 100, 10, 10, 0.7)
     person = detection(100, 100, 30, 100, 0.3)
-    assert [(each.size_px.tolist(), each.score) for each in fuse([head, shoe, other], [False] * 3, [person])] == [
+    assert [
+        (each.size_px.tolist(), each.score) for each in fuse([head, shoe, other], [False] * 3, [False] * 3, [person])
+    ] == [
         ([30, 100], 0.9),
         ([10, 10], 0.7),
     ]
     aeroplane, front = detection(300, 100, 120, 60, 0.8), detection(255, 100, 30, 60, 0.3)
-    assert [each.size_px.tolist() for each in fuse([aeroplane], [False], [front])] == [
+    assert [each.size_px.tolist() for each in fuse([aeroplane], [False], [False], [front])] == [
         [120, 60]
     ]  # its front alone has changed
+    bird, cloud = detection(110, 90, 12, 8, 0.9), detection(100, 100, 60, 50, 0.3)
+    assert [(len(fuse([bird], [False], [own], [cloud])), own) for own in (False, True)] == [(1, False), (2, True)]
     outline = detection(100, 100, 34, 104, 0.8)
-    assert [each.size_px.tolist() for each in fuse([outline], [True], [person])] == [[34, 104]]
-    assert [each.size_px.tolist() for each in fuse([outline], [False], [person])] == [[30, 100]]
+    assert [each.size_px.tolist() for each in fuse([outline], [True], [False], [person])] == [[34, 104]]
+    assert [each.size_px.tolist() for each in fuse([outline], [False], [False], [person])] == [[30, 100]]
 
 
 def test_what_sways_at_one_place_loses_its_score_and_what_flies_through_does_not():
