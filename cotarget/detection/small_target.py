@@ -2,8 +2,8 @@
 
 Movement alone cannot find a bird that hovers, and contrast alone finds every sign and chimney. The score multiplies
 both: the contrast in standard deviations of the surroundings, and the part of it that was not there before, in units of
-what air, codec and camera shake change of a thing that stands. While the camera stands still, the difference from
-earlier images is searched too, which finds a bird in front of foliage or beside a roof's edge.
+what air, codec and camera shake change of a thing that stands. Unless the camera pans, the difference from earlier
+images is searched too, which finds a bird in front of foliage or beside a roof's edge.
 
 - `CameraMotion` estimates the shift of the image since the first frame.
 - `History` and `changes` compare a place with earlier images, in the scene's own frame.
@@ -618,8 +618,9 @@ MOST_RISE = 1.5
 LEAST_DIFFERENCE, EVEN_DIFFERENCE = 7.0, 12.0
 # Fewest of the AGES_S for which there must be an image.
 FEWEST_EARLIER = 3
-# Images are subtracted without registration if the camera shifted by less between them [px].
-STANDING_PX = 0.5
+# Shift of the camera between two images up to which they are subtracted as they are, and up to which after they are
+# registered [px].
+STANDING_PX, SHAKING_PX = 0.5, 5.0
 # Usual difference, such as of a swaying branch, subtracted from the difference: its factor, the weight of the newest
 # image in its mean, and the width over which it spreads [px].
 USUAL_TIMES, USUAL_GAIN, SWAY_PX = 3.0, 0.02, 5
@@ -698,12 +699,14 @@ class SmallTargetDetector:
     def _differing(
         self, grey: Image, unit: int, shift: Array, references: list[tuple[Image, Array] | None]
     ) -> list[tuple[SmallTarget, Detection]]:
-        """Find regions in the difference from all earlier images, if there are enough and the camera stood still."""
+        """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved."""
         earlier = [kept for kept in references if kept is not None]
-        if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > STANDING_PX for _, then in earlier):
+        if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > SHAKING_PX for _, then in earlier):
             self._usual = None
             return []
-        difference = functools.reduce(cv2.min, (cv2.absdiff(grey, picture) for picture, _ in earlier))
+        difference = functools.reduce(
+            cv2.min, (cv2.absdiff(grey, _registered(picture, shift - then)) for picture, then in earlier)
+        )
         if self._usual is None:
             self._usual = np.zeros(grey.shape, np.float32)
         usual = cv2.dilate(cv2.convertScaleAbs(self._usual, alpha=USUAL_TIMES), np.ones((SWAY_PX, SWAY_PX), np.uint8))
@@ -736,6 +739,15 @@ class SmallTargetDetector:
             if detection.score >= LEAST_SCORE:
                 found.append((target, detection))
         return found
+
+
+def _registered(picture: Image, off: Array) -> Image:
+    """Move an image by the shift of the scene since then, (2,) [px]; its border fills what is uncovered."""
+    if np.abs(off).max() <= STANDING_PX:
+        return picture
+    height, width = picture.shape
+    u, v = (np.array([width - 1, height - 1]) / 2 - off).tolist()
+    return np.asarray(cv2.getRectSubPix(picture, (width, height), (u, v)), dtype=np.uint8)
 
 
 def _as_a_whole(
