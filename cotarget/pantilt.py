@@ -20,6 +20,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
+import cv2
 import numpy as np
 
 from cotarget.errors import UnreachableError
@@ -72,10 +73,11 @@ def base_head(pan: float, tilt: float, head: HeadGeometry = IDEAL_HEAD) -> Rigid
     Positive pan turns the camera right, positive tilt up. T_base_head is the identity at true pan = tilt = 0.
     """
     true_pan, true_tilt = (float(angle) for angle in head.true_angles(pan, tilt))
-    offset = RigidTransform.from_translation([0.0, 0.0, head.axis_offset])
-    tilting = RigidTransform.from_rotation(Rotation.from_rotvec(head.tilt_axis * true_tilt))
-    panning = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, true_pan, 0.0]))
-    return panning * offset * tilting * offset.inv()
+    panning = cv2.Rodrigues(np.array([0.0, true_pan, 0.0]))[0]
+    turned = panning @ cv2.Rodrigues(head.tilt_axis * true_tilt)[0]
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turned, (panning - turned)[:, 2] * head.axis_offset
+    return RigidTransform(T, normalize=False)
 
 
 def towards(x_base: Array) -> tuple[float, float]:
