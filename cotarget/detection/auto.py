@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.detection.background import LARGE, BackgroundDetector
 from cotarget.detection.base import Detection
@@ -99,8 +100,12 @@ class AutoDetector:
         self._large.held = self._held
         large = [replace(each, score=LARGE_SCORE) for each in self._large.detect(frame)]
         outlined = [target.beside <= PLAIN for target, _ in targets]
-        followed = [self._is_followed(each) for each in small]
-        return fuse(small, outlined, followed, [each for each in large if each.size_px.max() >= LARGE_PART * width])
+        return fuse(
+            small,
+            outlined,
+            self._are_followed(small),
+            [each for each in large if each.size_px.max() >= LARGE_PART * width],
+        )
 
     def _register(self, t: float, width: int) -> bool:
         """Give the background model the camera's shift; whether the camera has stood still for STEADY_S."""
@@ -117,13 +122,12 @@ class AutoDetector:
         self._large.shift = off if np.abs(off).max() > QUIET_PART * width else np.zeros(2)
         return all(np.abs(shift - before).max() <= least for _, before in self._shifts)
 
-    def _is_followed(self, each: Detection) -> bool:
-        """Whether a confirmed track of its size follows a small target."""
-        return any(
-            (np.abs(each.center_px - center) < size / 2 + HELD_PART * self._width).all()
-            and 1 / ALIKE < each.size_px.max() / size.max() < ALIKE
-            for center, size in self._followed
-        )
+    def _are_followed(self, small: Sequence[Detection]) -> list[bool]:
+        """Whether a confirmed track of its size follows each small target."""
+        ratio = np.log([each.size_px.max() for each in small])[:, None] - np.log([s.max() for _, s in self._followed])
+        margin = HELD_PART * self._width
+        near = _within(small, [(center, size + 2 * margin) for center, size in self._followed])
+        return (near & (np.abs(ratio) < np.log(ALIKE))).any(axis=1).tolist()
 
     def hold(self, tracks: Sequence["Track"]) -> None:
         """Do not learn the background under the confirmed ones of the last image's tracks, from the next image on."""
@@ -174,8 +178,8 @@ class Clutter:
             self._usual, self._t = np.zeros((2 * CELLS, CELLS)), t
         now = np.zeros_like(self._usual)
         weighed = []
-        for each in found:
-            if not any((np.abs(each.center_px - center) < size / 2).all() for center, size in held):
+        for each, is_held in zip(found, np.any(_within(found, held), axis=1), strict=True):
+            if not is_held:
                 u, v = np.clip(each.center_px / side, 0, (CELLS - 1, 2 * CELLS - 1)).astype(int).tolist()
                 nearby = now[max(0, v - 1) : v + 2, max(0, u - 1) : u + 2]
                 np.maximum(nearby, each.score, out=nearby)
@@ -216,6 +220,15 @@ def fuse(
         found = [each for each in found if not any(each is part for part in parts)]
         found.append(replace(whole, score=max([whole.score, *(part.score for part in parts)])))
     return sorted(found, key=lambda each: -each.score)
+
+
+def _within(found: Sequence[Detection], places: Sequence[tuple[Array, Array]]) -> npt.NDArray[np.bool_]:
+    """Whether the centre of each target is in each place, given by centre and size [px], (n, m)."""
+    at, center = (
+        np.array(each).reshape(-1, 2) for each in ([each.center_px for each in found], [c for c, _ in places])
+    )
+    half = np.array([size for _, size in places]).reshape(-1, 2) / 2
+    return np.asarray((np.abs(at[:, None] - center) < half).all(axis=2))
 
 
 def _covered(one: Detection, other: Detection) -> float:
