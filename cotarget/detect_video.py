@@ -212,7 +212,8 @@ def run_on_folder(
         progress: called before every film with (films done, films in all, what).
 
     Returns:
-        "pooled": scores over all films; "films": summary and score of each film, by its name.
+        "pooled": scores over all films that have a labelled frame; "films": summary and score of each film, by its
+        name.
 
     Raises:
         CotargetError: a film or its labels cannot be read, or a file cannot be written.
@@ -225,8 +226,9 @@ def run_on_folder(
         summary = run_on_film(film, target, table)
         tracks, frames = read_tracks(table), summary.last_frame + 1
         score = score_tracks(tracks, boxes, summary.rate_hz, frames, criterion=criterion)
-        scores.append(score)
-        minutes += frames / summary.rate_hz / 60
+        if min(boxes) < frames:  # otherwise they are labels of another film
+            scores.append(score)
+            minutes += frames / summary.rate_hz / 60
         results[film.stem] = dataclasses.asdict(summary) | dataclasses.asdict(score)
         matches = [each for each in match_frames(tracks, boxes, criterion) if LEARNING_FRAMES <= each.frame < frames]
         tiles += [(film, mistake) for mistake in mistakes(matches)]

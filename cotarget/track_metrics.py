@@ -463,9 +463,10 @@ def read_labels(path: Path) -> dict[int, list[Label]]:
     labels: dict[int, list[Label]] = {}
     for frame, target, x, y, width, height, counts in _label_rows(path):
         if not (width > 0 and height > 0 and frame >= 0 and frame == int(frame)):
+            first = int(_is_mot(path))
             raise ConfigError(
-                f"{path}: a label wants a whole frame from its first number on and a width and height above 0, not "
-                f"frame {frame:g}, {width:g} x {height:g} px"
+                f"{path}: a label wants a whole number of its frame, from {first} on, and a width and height above 0, "
+                f"not frame {frame + first:g}, {width:g} x {height:g} px"
             )
         size, boxes = np.array([width, height]), labels.setdefault(int(frame), [])
         # A box of w pixels from column x covers columns x to x + w - 1.

@@ -117,6 +117,7 @@ def reason_of(error: Exception) -> str:
 FALLBACK_RATE_HZ = 25.0  # frame rate of a film that does not state its own [Hz]
 # Containers whose header holds the duration; for others FFmpeg estimates it from the content or the bit rate.
 TELL_DURATION = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "flv", "asf")
+FROM_ZERO = "matroska,webm"  # its duration counts from time 0, and not from the first frame
 MICROSECONDS = 1e6  # FFmpeg's units of duration per second
 # Least shortfall of a film, the longer of the two: the last frame's length and edits at the end are stated roughly.
 SHORT_S, SHORT_FRAMES = 0.5, 3
@@ -234,7 +235,9 @@ class Film:
         if container.format.name == "avi" and stream.frames and stream.time_base is not None:
             stated = float(stream.frames * stream.time_base)  # FFmpeg estimates AVI's duration from the file's size
         elif container.format.name in TELL_DURATION and container.duration is not None:
-            begin, stated = (container.start_time or 0) / MICROSECONDS, container.duration / MICROSECONDS
+            stated = container.duration / MICROSECONDS
+            if container.format.name != FROM_ZERO:
+                begin = (container.start_time or 0) / MICROSECONDS
         if begin + stated - self._end > max(SHORT_S, SHORT_FRAMES / self.rate_hz):
             return f"the film says that it lasts {stated:.1f} s, and ends at {max(self._end - begin, 0.0):.1f} s"
         # In AVI every frame is a slot of its time, even an empty one; a lost frame makes the others come too early.

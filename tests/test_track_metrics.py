@@ -304,6 +304,19 @@ def test_the_command_scores_a_folder_of_films(folder, capsys):
     assert np.median(dark[:, 1]) == pytest.approx(49.5, abs=5)
 
 
+def test_labels_of_another_film_are_told_and_not_pooled(folder, capsys):
+    labels = folder / "films" / "two.csv"
+    labels.write_text("frame,x_px,y_px,width_px,height_px\n5000,5,5,9,9\n")
+    assert detect_folder(folder) == 0
+    out, err = capsys.readouterr()
+    assert err.endswith(
+        f"{labels}: 1 of 1 labelled frames are beyond the last one, 79, and are not counted; are the labels of another "
+        "film?\n"
+    )
+    pooled = json.loads(out)["pooled"]
+    assert (pooled["films"], pooled["recall"], pooled["false_tracks"]) == (1, 1.0, 0)
+
+
 @pytest.mark.parametrize(("labels", "more", "named"), [
     ("tables", (), "one.mp4: has no labels; give"),
     ("films/one.csv", (), "--labels: .*one.csv is no folder"),

@@ -76,8 +76,8 @@ def test_films_that_cannot_be_read_name_the_file(tmp_path):
     assert not (tmp_path / "out.csv").exists()
 
 
-def other_film(path, codec, count=60, empty_from=None, **options):
-    """A film of noise in any container; from a frame on only every tenth is there."""
+def other_film(path, codec, count=60, empty_from=None, begin=0, **options):
+    """A film of noise in any container, from a number of frames on; from a frame on only every tenth is there."""
     rng = np.random.default_rng(0)
     with av.open(str(path), "w", options=options) as out:
         stream = out.add_stream(codec, rate=25)
@@ -86,7 +86,7 @@ def other_film(path, codec, count=60, empty_from=None, **options):
             if empty_from is not None and i >= empty_from and i % 10:
                 continue
             picture = av.VideoFrame.from_ndarray(rng.integers(0, 256, (120, 160, 3), np.uint8), format="bgr24")
-            picture.pts, picture.time_base = i, Fraction(1, 25)
+            picture.pts, picture.time_base = begin + i, Fraction(1, 25)
             out.mux(stream.encode(picture))
         out.mux(stream.encode(None))
 
@@ -200,6 +200,14 @@ def test_frames_missing_from_an_avi_are_counted(tmp_path):
         f"of the 60 frames that it says it has {lost} are lost, and those after them come too early"
     )
     assert times[-1] == pytest.approx((59 - lost) / RATE, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["a.mkv", "a.mp4"])
+def test_a_film_whose_time_does_not_begin_at_zero_is_whole(tmp_path, name):
+    other_film(tmp_path / name, "libx264", begin=25_000)
+    with Film(tmp_path / name) as film:
+        assert len(list(film)) == 60
+    assert film.shortfall == ""
 
 
 @pytest.mark.parametrize("codec", ["mpeg4", "mjpeg"])

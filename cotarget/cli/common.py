@@ -154,13 +154,24 @@ def scores_of(
     if labels is None:
         return {}
     score = score_tracks(tracks, labels, rate_hz, frames, criterion=criterion or Criterion())
-    if score.labels_beyond_end:
+    tell_beyond_end(file, score.labels_beyond_end, len(labels), frames - 1, whole=whole)
+    return dataclasses.asdict(score)
+
+
+def tell_beyond_end(file: Path | None, beyond: int, labelled: int, last: int, *, whole: bool) -> None:
+    """Tell on stderr how many of the labelled frames are beyond a film's last one; nothing if none is."""
+    if beyond:
         print(
-            f"{file}: {score.labels_beyond_end} of {len(labels)} labelled frames are beyond the last one, "
-            f"{frames - 1}, and are not counted{'; are the labels of another film?' if whole else ''}",
+            f"{file}: {beyond} of {labelled} labelled frames are beyond the last one, {last}, and are not counted"
+            f"{'; are the labels of another film?' if whole else ''}",
             file=sys.stderr,
         )
-    return dataclasses.asdict(score)
+
+
+def tell_shortfall(film: Path, shortfall: str | None) -> None:
+    """Tell on stderr what is missing of a film; nothing if it is whole."""
+    if shortfall is not None:
+        print(f"{film}: is not whole: {shortfall}; the results are of what there is", file=sys.stderr)
 
 
 # Outputs

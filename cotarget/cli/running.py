@@ -11,7 +11,17 @@ from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.common import check_outputs, load_plausible, naming, print_json, progress_bar, rig_files, scores_of
+from cotarget.cli.common import (
+    check_outputs,
+    load_plausible,
+    naming,
+    print_json,
+    progress_bar,
+    rig_files,
+    scores_of,
+    tell_beyond_end,
+    tell_shortfall,
+)
 from cotarget.errors import ConfigError
 from cotarget.files import STDOUT
 
@@ -197,13 +207,13 @@ def detect_command(options: argparse.Namespace) -> None:
     frames = found.last_frame + 1
     scores = scores_of(options.labels, tracks, labels, found.rate_hz, frames, whole=whole, criterion=criterion)
     print_json(dataclasses.asdict(found) | scores, options.csv)
-    if not whole:
-        print(f"{options.film}: is not whole: {found.shortfall}; the results are of what there is", file=sys.stderr)
+    tell_shortfall(options.film, found.shortfall)
 
 
 def _detect_in_folder(options: argparse.Namespace, target: "TargetProfile", criterion: "Criterion") -> None:
     """Score the videos of a folder by the labels of another."""
     from cotarget.detect_video import labelled_films, run_on_folder
+    from cotarget.track_metrics import read_labels
 
     if options.video is not None:
         raise ConfigError("--video: draws the tracks of one video, not of a folder")
@@ -217,7 +227,13 @@ def _detect_in_folder(options: argparse.Namespace, target: "TargetProfile", crit
     tables = [options.csv / f"{film.stem}.csv" for film, _ in films]
     check_outputs([*tables, options.sheet], [path for pair in films for path in pair])
     with progress_bar() as progress:
-        print_json(run_on_folder(films, target, options.csv, options.sheet, criterion, progress))
+        found = run_on_folder(films, target, options.csv, options.sheet, criterion, progress)
+    print_json(found)
+    for film, file in films:
+        one, labelled = found["films"][film.stem], len(read_labels(file))
+        tell_shortfall(film, one["shortfall"])
+        whole = one["shortfall"] is None
+        tell_beyond_end(file, one["labels_beyond_end"], labelled, one["last_frame"], whole=whole)
 
 
 def doctor_command(options: argparse.Namespace) -> int:

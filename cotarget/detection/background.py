@@ -212,7 +212,7 @@ class BackgroundDetector:
         image = _shifted(image, -shift)
         mask = self._subtract(image, frame.t, factor)
         if self._settings.shadows:
-            mask = cv2.compare(mask, FOREGROUND, cv2.CMP_EQ)
+            mask = cv2.threshold(mask, FOREGROUND - 1, FOREGROUND, cv2.THRESH_BINARY)[1]
         if self._settings.brightest > 1.0:
             mask = self._unlit(mask, image)
         if self._settings.sway_px:

@@ -721,7 +721,8 @@ class SmallTargetDetector:
         unusual = cv2.subtract(difference, usual)
         # A sky is zero but for the target; its surroundings are needed as well.
         least = LEAST_DIFFERENCE * LEAST_ROUGHNESS
-        left, top, width, height = cv2.boundingRect(cv2.compare(cv2.blur(unusual, (INNER_PX,) * 2), least, cv2.CMP_GE))
+        there = cv2.threshold(cv2.blur(unusual, (INNER_PX,) * 2), least, 255, cv2.THRESH_BINARY)[1]
+        left, top, width, height = cv2.boundingRect(there)
         if not width:
             return []
         left, top, right, bottom = (left - REACH_PX, top - REACH_PX, left + width + REACH_PX, top + height + REACH_PX)

@@ -299,6 +299,13 @@ def test_light_that_changes_everywhere_is_no_target():
     assert watch(motion("bird"), pictures)[-1] == []
 
 
+@pytest.mark.parametrize("name", ["mog2", "motion", "speck", "auto"])
+def test_an_image_of_one_pixel_is_no_error(name):
+    detector = make_detector(dataclasses.replace(DEFAULT_TARGETS["bird"], detector=name), 25.0)
+    for i in range(20):
+        assert detector.detect(Frame(np.full((1, 1, 3), 12 * i, np.uint8), i / 25)) == []
+
+
 def test_times_that_repeat_or_jump_back_do_no_harm():
     rng = np.random.default_rng(8)
     detector = motion("bird")
