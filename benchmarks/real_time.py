@@ -7,7 +7,6 @@ sent until its command. The film of 3840x2160 is read from a file as fast as it 
 """
 
 import contextlib
-import itertools
 import multiprocessing
 import sys
 import tempfile
@@ -21,7 +20,7 @@ from unittest import mock
 
 import numpy as np
 
-from benchmarks.frame_sizes import RATE_HZ, film
+from benchmarks.frame_sizes import BIRD_PX, RATE_HZ, film
 from benchmarks.pipeline_speed import Pipeline
 from cotarget.drivers.axis import AxisCamera, AxisSettings
 from cotarget.drivers.clock import MonotonicClock
@@ -34,6 +33,7 @@ from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.emulators.serve import Faults
 from cotarget.emulators.world import EmulatedAxis, WallClock
 from cotarget.errors import DeviceError
+from cotarget.geometry import Array
 from cotarget.rig import Image
 from cotarget.sim.motion import Axis
 from cotarget.video import Film, FilmWriter
@@ -43,11 +43,12 @@ from experiments.wire.rig import beside
 STREAM, FILE = (1920, 1080), (3840, 2160)
 PERCENTILES = (50, 95, 99)
 LENGTH = 75  # frames of the film, which goes forth and back
+ORDER = [*range(LENGTH), *range(LENGTH - 2, 0, -1)]  # frame of the film that each frame sent shows, again and again
 QUALITY = 70  # of JPEG
 STEPS_S = 1e6  # speed of the emulated head, which need not be waited for
 WAIT_S = 0.01  # between two looks whether the other side has connected
 ALL_SENT_S = 1.0  # after the last frame is due, none comes any more
-# Goals: frames missed of so many, age of a frame at its command [ms], frames of the file a second.
+# Goals: one frame missed of this number, age of a frame at its command [ms], frames of the file a second.
 MISSED_OF, MOST_AGE_MS, LEAST_HZ = 1500, 100.0, 12.0
 
 
@@ -73,7 +74,6 @@ def serve(pipe: Connection, frames: int, sent: Any) -> None:
     """
     sys.setswitchinterval(5e-4)  # as in `cotarget emulate`
     images = [frame.image for frame, _ in film(STREAM, LENGTH, 0)]
-    order = itertools.cycle([*range(LENGTH), *range(LENGTH - 2, 0, -1)])
     encoded: dict[int, bytes] = {}
 
     def once(image: Image, quality: int, size: tuple[int, int] | None = None) -> bytes:
@@ -100,7 +100,7 @@ def serve(pipe: Connection, frames: int, sent: Any) -> None:
                 if pipe.poll(max(begun + index / RATE_HZ - time.monotonic(), 0.0)):
                     return
                 sent[index] = time.monotonic()
-                feed.publish(Picture(images[next(order)], index, sent[index]))
+                feed.publish(Picture(images[ORDER[index % len(ORDER)]], index, sent[index]))
             pipe.recv()
     finally:
         ports.close()
@@ -115,6 +115,7 @@ def _stream(settings: RealTimeSettings, seed: int) -> list[Row]:
     times = [0.0, *[np.inf] * settings.frames]
     sent = multiprocessing.get_context("spawn").Array("d", times, lock=False)
     ages: dict[int, float] = {}
+    birds = [bird for _, bird in film(STREAM, LENGTH, 0)]
     clock, pipeline = MonotonicClock(), Pipeline(settings.detector, STREAM, RATE_HZ)
     with beside(serve, settings.frames, sent) as (url, port):
         camera = AxisCamera(AxisSettings(url=url, size=STREAM, resolution="", latency_s=0.0), clock)
@@ -128,12 +129,25 @@ def _stream(settings: RealTimeSettings, seed: int) -> list[Row]:
                     t = frame.t
                     if pipeline(frame)["aimed"] and pipeline.aim is not None:
                         head.move(pipeline.aim.pan, pipeline.aim.tilt)
-                    index = int(np.searchsorted(np.array(sent), t, side="right")) - 1
+                    index = frame_sent(frame.image, int(np.searchsorted(np.array(sent), t, side="right")) - 1, birds)
                     ages[index] = clock.now() - sent[index]
     return [
         {"seed": seed, "part": "stream", "frame": index, "age_ms": 1e3 * ages[index] if index in ages else None}
         for index in range(settings.untimed + 1, settings.frames + 1)
     ]
+
+
+def frame_sent(image: Image, latest: int, birds: Sequence[Array]) -> int:
+    """Find which frame sent an image is, by the place of the bird in it.
+
+    Args:
+        image: image of the stream, (H, W, 3).
+        latest: number of the latest frame sent.
+        birds: centre of the bird in each frame of the film, (2,) [px].
+    """
+    corners = (np.rint(bird - (BIRD_PX - 1) / 2).astype(int) for bird in birds)
+    shown = int(np.argmin([image[v : v + BIRD_PX, u : u + BIRD_PX].mean() for u, v in corners]))
+    return next(index for index in range(latest, latest - len(ORDER), -1) if ORDER[index % len(ORDER)] == shown)
 
 
 def _file(settings: RealTimeSettings, seed: int) -> Row:

@@ -19,6 +19,7 @@ from annotated_types import Gt
 
 from cotarget.config import RigConfig
 from cotarget.detection import AutoDetector, BackgroundDetector, SmallTargetDetector, make_detector
+from cotarget.errors import CotargetError
 from cotarget.evaluation import true_calibration
 from cotarget.fusion import TargetFusion
 from cotarget.pipeline import follow
@@ -106,9 +107,13 @@ def one(settings: TurnSettings, seed: int) -> list[Row]:
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return [row for name in settings.targets for row in _turns(settings, name, seed)]
+        rows = {name: list(_turns(settings, name, seed)) for name in settings.targets}
     finally:
         cv2.setNumThreads(threads)
+    for name, mine in rows.items():
+        if not mine:
+            raise CotargetError(f"{name}: was followed in no turn after the first {UNTIMED}; give more seconds")
+    return [row for mine in rows.values() for row in mine]
 
 
 def _turns(settings: TurnSettings, name: str, seed: int) -> Iterator[Row]:

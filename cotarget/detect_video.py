@@ -226,7 +226,7 @@ def run_on_folder(
         summary = run_on_film(film, target, table)
         tracks, frames = read_tracks(table), summary.last_frame + 1
         score = score_tracks(tracks, boxes, summary.rate_hz, frames, criterion=criterion)
-        if min(boxes) < frames:  # otherwise they are labels of another film
+        if min(boxes) < frames:  # otherwise no labelled frame is in the film
             scores.append(score)
             minutes += frames / summary.rate_hz / 60
         results[film.stem] = dataclasses.asdict(summary) | dataclasses.asdict(score)

@@ -465,7 +465,7 @@ def read_labels(path: Path) -> dict[int, list[Label]]:
         if not (width > 0 and height > 0 and frame >= 0 and frame == int(frame)):
             first = int(_is_mot(path))
             raise ConfigError(
-                f"{path}: a label wants a whole number of its frame, from {first} on, and a width and height above 0, "
+                f"{path}: a label wants a whole frame number from {first} on and a width and height above 0, "
                 f"not frame {frame + first:g}, {width:g} x {height:g} px"
             )
         size, boxes = np.array([width, height]), labels.setdefault(int(frame), [])

@@ -154,12 +154,12 @@ def scores_of(
     if labels is None:
         return {}
     score = score_tracks(tracks, labels, rate_hz, frames, criterion=criterion or Criterion())
-    tell_beyond_end(file, score.labels_beyond_end, len(labels), frames - 1, whole=whole)
+    warn_beyond_end(file, score.labels_beyond_end, len(labels), frames - 1, whole=whole)
     return dataclasses.asdict(score)
 
 
-def tell_beyond_end(file: Path | None, beyond: int, labelled: int, last: int, *, whole: bool) -> None:
-    """Tell on stderr how many of the labelled frames are beyond a film's last one; nothing if none is."""
+def warn_beyond_end(file: Path | None, beyond: int, labelled: int, last: int, *, whole: bool) -> None:
+    """Warn on stderr of labelled frames beyond a film's last one, if there are any."""
     if beyond:
         print(
             f"{file}: {beyond} of {labelled} labelled frames are beyond the last one, {last}, and are not counted"
@@ -168,8 +168,8 @@ def tell_beyond_end(file: Path | None, beyond: int, labelled: int, last: int, *,
         )
 
 
-def tell_shortfall(film: Path, shortfall: str | None) -> None:
-    """Tell on stderr what is missing of a film; nothing if it is whole."""
+def warn_shortfall(film: Path, shortfall: str | None) -> None:
+    """Warn on stderr of what a film lacks, if it is not whole."""
     if shortfall is not None:
         print(f"{film}: is not whole: {shortfall}; the results are of what there is", file=sys.stderr)
 

@@ -19,8 +19,8 @@ from cotarget.cli.common import (
     progress_bar,
     rig_files,
     scores_of,
-    tell_beyond_end,
-    tell_shortfall,
+    warn_beyond_end,
+    warn_shortfall,
 )
 from cotarget.errors import ConfigError
 from cotarget.files import STDOUT
@@ -207,7 +207,7 @@ def detect_command(options: argparse.Namespace) -> None:
     frames = found.last_frame + 1
     scores = scores_of(options.labels, tracks, labels, found.rate_hz, frames, whole=whole, criterion=criterion)
     print_json(dataclasses.asdict(found) | scores, options.csv)
-    tell_shortfall(options.film, found.shortfall)
+    warn_shortfall(options.film, found.shortfall)
 
 
 def _detect_in_folder(options: argparse.Namespace, target: "TargetProfile", criterion: "Criterion") -> None:
@@ -231,9 +231,9 @@ def _detect_in_folder(options: argparse.Namespace, target: "TargetProfile", crit
     print_json(found)
     for film, file in films:
         one, labelled = found["films"][film.stem], len(read_labels(file))
-        tell_shortfall(film, one["shortfall"])
+        warn_shortfall(film, one["shortfall"])
         whole = one["shortfall"] is None
-        tell_beyond_end(file, one["labels_beyond_end"], labelled, one["last_frame"], whole=whole)
+        warn_beyond_end(file, one["labels_beyond_end"], labelled, one["last_frame"], whole=whole)
 
 
 def doctor_command(options: argparse.Namespace) -> int:

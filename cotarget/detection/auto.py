@@ -41,9 +41,9 @@ PLAIN = 5.0
 # A small target that covers the first part of a large one is the same target; one of which the large one covers less
 # than the second part is much larger.
 SAME, MOST = 0.6, 0.4
-# A small target is followed by a track if their larger sides differ by less than the first factor. Inside a large one
-# of more than so many times its area it is then another target, such as a bird before a cloud.
-ALIKE, MUCH = 2.0, 4.0
+# A track follows a small target if their larger sides differ by less than the first factor. Inside a large target whose
+# area is larger by more than the second factor, it is then another target, such as a bird before a cloud.
+SIDE_RATIO, AREA_RATIO = 2.0, 4.0
 # Part of a small target inside a large one from which it is a part of it.
 INSIDE = 0.5
 # Time for which the background under a confirmed track is not learnt, from when the track last moved by its size [s].
@@ -63,16 +63,17 @@ class AutoDetector:
         self._large = BackgroundDetector(LARGE, rate_hz)
         self._clutter = Clutter()
         self._width = 0
+        self._steady = False  # whether large targets were searched in the last image
         self._begun = np.zeros(2)  # the camera's shift when the background was begun [px]
         self._shifts: deque[tuple[float, Array]] = deque()  # the camera's shift in the last frames [px]
         self._moved: dict[int, tuple[float, Array]] = {}  # when a track last moved by its size, and where to
-        self._followed: list[tuple[Array, Array]] = []  # centre and size of each confirmed track
+        self._tracks: list[Track] = []  # confirmed tracks
         self._held: list[tuple[Array, Array]] = []  # centre and size of each place whose background is not learnt
 
     @property
     def mask(self) -> Image | None:
         """Foreground of the background model, and boxes of small targets by their score, (H, W), 0 to 255."""
-        small, large = self._small.mask, self._large.mask
+        small, large = self._small.mask, self._large.mask if self._steady else None
         return small if small is None or large is None else np.asarray(cv2.max(small, large), dtype=np.uint8)
 
     @property
@@ -93,9 +94,9 @@ class AutoDetector:
         """
         targets = self._small.find(frame)
         width = self._width = frame.image.shape[1]
-        steady = self._register(frame.t, width)
+        self._steady = self._register(frame.t, width)
         small = self._clutter.weigh([detection for _, detection in targets], frame.t, width, self._held)
-        if not steady:
+        if not self._steady:
             return sorted(small, key=lambda each: -each.score)
         self._large.held = self._held
         large = [replace(each, score=LARGE_SCORE) for each in self._large.detect(frame)]
@@ -124,20 +125,19 @@ class AutoDetector:
 
     def _are_followed(self, small: Sequence[Detection]) -> list[bool]:
         """Whether a confirmed track of its size follows each small target."""
-        ratio = np.log([each.size_px.max() for each in small])[:, None] - np.log([s.max() for _, s in self._followed])
-        margin = HELD_PART * self._width
-        near = _within(small, [(center, size + 2 * margin) for center, size in self._followed])
-        return (near & (np.abs(ratio) < np.log(ALIKE))).any(axis=1).tolist()
+        margin = 2 * HELD_PART * self._width
+        near = _within(small, [(track.center_px, track.size_px + margin) for track in self._tracks])
+        sides = np.log([each.size_px.max() for each in small]), np.log([each.size_px.max() for each in self._tracks])
+        alike = np.abs(np.subtract.outer(*sides)) < np.log(SIDE_RATIO)
+        return (near & alike).any(axis=1).tolist()
 
     def hold(self, tracks: Sequence["Track"]) -> None:
         """Do not learn the background under the confirmed ones of the last image's tracks, from the next image on."""
         margin = HELD_PART * self._width
         moved: dict[int, tuple[float, Array]] = {}
         self._held = []
-        self._followed = [(track.center_px, track.size_px) for track in tracks if track.confirmed]
-        for track in tracks:
-            if not track.confirmed:
-                continue
+        self._tracks = [track for track in tracks if track.confirmed]
+        for track in self._tracks:
             since, place = self._moved.get(track.id, (track.t, track.center_px))
             if np.abs(track.center_px - place).max() > track.size_px.max() + margin:
                 since, place = track.t, track.center_px
@@ -215,7 +215,7 @@ def fuse(
             each
             for each, own in zip(small, followed, strict=True)
             if (_covered(each, whole) > INSIDE or _covered(whole, each) > SAME)
-            and not (own and MUCH * each.size_px.prod() < whole.size_px.prod())
+            and not (own and AREA_RATIO * each.size_px.prod() < whole.size_px.prod())
         ]
         found = [each for each in found if not any(each is part for part in parts)]
         found.append(replace(whole, score=max([whole.score, *(part.score for part in parts)])))
@@ -224,11 +224,9 @@ def fuse(
 
 def _within(found: Sequence[Detection], places: Sequence[tuple[Array, Array]]) -> npt.NDArray[np.bool_]:
     """Whether the centre of each target is in each place, given by centre and size [px], (n, m)."""
-    at, center = (
-        np.array(each).reshape(-1, 2) for each in ([each.center_px for each in found], [c for c, _ in places])
-    )
-    half = np.array([size for _, size in places]).reshape(-1, 2) / 2
-    return np.asarray((np.abs(at[:, None] - center) < half).all(axis=2))
+    at = np.reshape([each.center_px for each in found], (-1, 1, 2))
+    center, size = (np.reshape([place[i] for place in places], (-1, 2)) for i in (0, 1))
+    return np.asarray((np.abs(at - center) < size / 2).all(axis=2))
 
 
 def _covered(one: Detection, other: Detection) -> float:

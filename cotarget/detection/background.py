@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detection, box_detection, check_size, flood
+from cotarget.detection.base import Detection, box_detection, check_size, flood, is_clipped, moved
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
@@ -127,8 +127,7 @@ PERSON = BackgroundSettings(
 # A target of unknown shape may be as wide as it likes, so it may be a patch of light on the ground.
 GENERAL = replace(PERSON, bridge_px=(9, 9), smallest_px=(6, 6), smallest_area_px=40, widest=np.inf, flat=0.0)
 
-# Large targets of any kind: people and cars, from a quarter of the width of a film of 640x480. What stands side by side
-# is not bridged.
+# Large targets of any kind, such as people and cars. What stands side by side is not bridged.
 LARGE = replace(
     GENERAL,
     warm_up_s=0.2,
@@ -209,7 +208,7 @@ class BackgroundDetector:
             image = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
             factor *= 2
         shift = self.shift / factor
-        image = _shifted(image, -shift)
+        image = moved(image, -shift)
         mask = self._subtract(image, frame.t, factor)
         if self._settings.shadows:
             mask = cv2.threshold(mask, FOREGROUND - 1, FOREGROUND, cv2.THRESH_BINARY)[1]
@@ -222,9 +221,9 @@ class BackgroundDetector:
             near = cv2.dilate(opened, np.ones((2 * self._settings.rim_px + 1,) * 2, np.uint8))
             mask = np.asarray(cv2.bitwise_and(mask, near), dtype=np.uint8)
         if shift.any():  # what has come into view is not known
-            seen = _shifted(np.full(mask.shape, FOREGROUND, np.uint8), -shift, cv2.BORDER_CONSTANT)
+            seen = _moved_mask(np.full(mask.shape, FOREGROUND, np.uint8), -shift)
             mask = np.asarray(cv2.bitwise_and(mask, cv2.compare(seen, FOREGROUND, cv2.CMP_EQ)), dtype=np.uint8)
-        self._foreground = _shifted(mask, shift, cv2.BORDER_CONSTANT)
+        self._foreground = _moved_mask(mask, shift)
         if self._learnt < self._settings.warm_up_s:
             return []
         if flood(mask):
@@ -238,6 +237,8 @@ class BackgroundDetector:
                 each,
                 center_px=factor * (each.center_px + shift) + (factor - 1) / 2,
                 size_px=factor * each.size_px,
+                # By the image's border, or by that of the background that is known.
+                clipped=each.clipped or is_clipped(each.center_px + shift, each.size_px, mask.shape),
             )
             for each in self._boxes(mask)
             if not self._settings.edged or self._has_edge(image, mask, _rows_and_columns(each))
@@ -266,8 +267,7 @@ class BackgroundDetector:
 
         A target that stood there when the background was learnt, and has left, leaves such a place.
         """
-        rows, columns = (slice(max(0, each.start - EDGE_PX), each.stop + EDGE_PX) for each in box)
-        box = rows, columns
+        box = _enlarged(box)
         if not mask[box].any():
             return False
         nearby = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
@@ -279,12 +279,16 @@ class BackgroundDetector:
         return now < GHOST * before
 
     def _has_edge(self, image: Image, mask: Image, box: tuple[slice, slice]) -> bool:
-        """Whether the foreground in a box has a sharp edge, and not only because it has one in the background."""
+        """Whether the foreground in a box has a sharp edge, and not only because it has one in the background.
+
+        The edge lies just outside of the box where the rim of a dark target counts as shadow.
+        """
+        around = _enlarged(box)
         now, before = (
-            cv2.cvtColor(each[box], cv2.COLOR_BGR2GRAY).astype(np.float32) for each in (image, self._background())
+            cv2.cvtColor(each[around], cv2.COLOR_BGR2GRAY).astype(np.float32) for each in (image, self._background())
         )
         difference = now - before
-        contrast = np.quantile(np.abs(difference[mask[box] != 0]), CONTRAST_PART)
+        contrast = np.quantile(np.abs(difference[mask[around] != 0]), CONTRAST_PART)
         slopes = cv2.magnitude(*(cv2.Sobel(difference, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (0, 1)))
         return contrast < SOFT_PX * np.quantile(slopes, SLOPE_PART) and not self._is_ghost(image, mask, box)
 
@@ -381,12 +385,18 @@ def _rows_and_columns(box: Detection) -> tuple[slice, slice]:
     return v, u
 
 
-def _shifted(image: Image, shift: Array, border: int = cv2.BORDER_REPLICATE) -> Image:
-    """Move an image by (du, dv) [px]; the border's pixels fill what is uncovered, or 0 for ``BORDER_CONSTANT``."""
+def _enlarged(box: tuple[slice, slice]) -> tuple[slice, slice]:
+    """Enlarge a part of an image by EDGE_PX to each side, up to the image's border."""
+    rows, columns = (slice(max(0, each.start - EDGE_PX), each.stop + EDGE_PX) for each in box)
+    return rows, columns
+
+
+def _moved_mask(mask: Image, shift: Array) -> Image:
+    """Move a mask by (du, dv) [px]; 0 fills what is uncovered."""
     if not shift.any():
-        return image
+        return mask
     matrix = np.column_stack([np.eye(2), shift])
-    return np.asarray(cv2.warpAffine(image, matrix, image.shape[1::-1], borderMode=border), dtype=np.uint8)
+    return np.asarray(cv2.warpAffine(mask, matrix, mask.shape[1::-1]), dtype=np.uint8)
 
 
 def pieces(mask: Image, bridge_px: tuple[int, int]) -> list[Sequence[int]]:

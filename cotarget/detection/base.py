@@ -68,8 +68,23 @@ def box_detection(x: int, y: int, w: int, h: int, score: float, shape: tuple[int
         score: confidence of the detector, 0 to 1.
         shape: shape of the image, (H, W, ...); a box at its border is clipped.
     """
-    clipped = x <= 0 or y <= 0 or x + w >= shape[1] or y + h >= shape[0]
-    return Detection(np.array([x + (w - 1) / 2, y + (h - 1) / 2]), np.array([w, h], dtype=float), score, clipped)
+    center, size = np.array([x + (w - 1) / 2, y + (h - 1) / 2]), np.array([w, h], dtype=float)
+    return Detection(center, size, score, is_clipped(center, size, shape))
+
+
+def is_clipped(center_px: Array, size_px: Array, shape: tuple[int, ...]) -> bool:
+    """Whether a box reaches the border of an image of a shape (H, W, ...)."""
+    low, high = center_px - (size_px - 1) / 2, center_px + (size_px - 1) / 2
+    return bool((low <= 0).any() or (high >= np.array(shape[1::-1]) - 1).any())
+
+
+def moved(image: Image, shift: Array) -> Image:
+    """Move an image by (du, dv) [px], interpolated linearly; its border's pixels fill what is uncovered."""
+    if not shift.any():
+        return image
+    height, width = image.shape[:2]
+    u, v = (np.array([width - 1, height - 1]) / 2 - shift).tolist()
+    return np.asarray(cv2.getRectSubPix(image, (width, height), (u, v)), dtype=np.uint8)
 
 
 def check_size(shape: tuple[int, ...] | None, image: Image) -> None:

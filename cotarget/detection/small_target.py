@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detection, box_detection, check_size
+from cotarget.detection.base import Detection, box_detection, check_size, moved
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
@@ -288,8 +288,8 @@ REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES_OF_DIFFERENCE, 2**SCALES_OF_DIF
 SLOPING_SCALE = 2
 # Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
 LEAST_ROUGHNESS = 1.5
-# For targets of one or two pixels, which fade in a larger mean, a window of 2x2 px is used. So many times as much does
-# the roughness of the surroundings count there: leaves and grass have such spots, a sky has none.
+# Factor by which the roughness of the surroundings counts for the mean of 2x2 px, in which targets of one or two pixels
+# are searched: leaves and grass have such spots, a sky has none.
 PAIR_TIMES = 2.0
 # How far beside a target other texture counts: in parts of its larger side, and in pixels of the texture.
 BESIDE, BESIDE_PX = 2.0, 6.0
@@ -453,7 +453,7 @@ def _peaks(
     off = cv2.max(cv2.subtract(low, dark), cv2.subtract(bright, high))
     pair, rougher = level, deviation
     if finest:
-        # Half a pixel beside, which is the mean of four, at a third of boxFilter's time.
+        # Linear interpolation halfway between pixels is the mean of 2x2 px, at a third of boxFilter's time.
         pair = cv2.getRectSubPix(level, size, (size[0] / 2 - 1, size[1] / 2 - 1))
         rougher = deviation * np.float32(PAIR_TIMES) - np.float32((PAIR_TIMES - 1) * LEAST_ROUGHNESS)
         low, high = _limits(mean, rougher, threshold, size)
@@ -585,8 +585,7 @@ def _median(values: np.ndarray) -> float:
 
 def _component(inside: np.ndarray, at: tuple[int, int]) -> tuple[int, int, int, int]:
     """Find the box of the connected component at a pixel (row, column): left, top, width and height."""
-    box = cv2.floodFill(inside.astype(np.uint8), None, at[::-1], (2,), flags=8)[3]
-    x, y, w, h = box
+    x, y, w, h = cv2.floodFill(inside.astype(np.uint8), None, at[::-1], (2,), flags=8)[3]
     return x, y, w, h
 
 
@@ -711,9 +710,11 @@ class SmallTargetDetector:
         if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > SHAKING_PX for _, then in earlier):
             self._usual = None
             return []
-        difference = functools.reduce(
-            cv2.min, (cv2.absdiff(grey, _registered(picture, shift - then)) for picture, then in earlier)
+        registered = (
+            picture if np.abs(shift - then).max() <= STANDING_PX else moved(picture, shift - then)
+            for picture, then in earlier
         )
+        difference = functools.reduce(cv2.min, (cv2.absdiff(grey, picture) for picture in registered))
         if self._usual is None:
             self._usual = np.zeros(grey.shape, np.float32)
         usual = cv2.dilate(cv2.convertScaleAbs(self._usual, alpha=USUAL_TIMES), np.ones((SWAY_PX, SWAY_PX), np.uint8))
@@ -747,15 +748,6 @@ class SmallTargetDetector:
             if detection.score >= LEAST_SCORE:
                 found.append((target, detection))
         return found
-
-
-def _registered(picture: Image, off: Array) -> Image:
-    """Move an image by the shift of the scene since then, (2,) [px]; its border fills what is uncovered."""
-    if np.abs(off).max() <= STANDING_PX:
-        return picture
-    height, width = picture.shape
-    u, v = (np.array([width - 1, height - 1]) / 2 - off).tolist()
-    return np.asarray(cv2.getRectSubPix(picture, (width, height), (u, v)), dtype=np.uint8)
 
 
 def _as_a_whole(

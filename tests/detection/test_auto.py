@@ -198,10 +198,55 @@ def test_a_cloud_that_drifts_is_no_target(soft):
     assert any(tracks) != soft
 
 
+@pytest.mark.parametrize("size", [(60, 24), (24, 60), (80, 160)])
+def test_a_dark_target_of_one_colour_is_found_before_a_textured_wall(size):
+    """The rim of a dark target is as dark as a shadow of the wall."""
+    rng, rate, found = np.random.default_rng(11), 25.0, []
+    wall = cv2.GaussianBlur(rng.normal(0, 1, (480, 640, 1)), (0, 0), 2.0)[..., None].repeat(3, axis=2)
+    detector = BackgroundDetector(LARGE, rate)
+    places = [None] * 20 + [(100 + 4 * i, 200) for i in range(50)]
+    for i, picture in enumerate(moved(120 + 20 * wall / wall.std(), np.full((*size[::-1], 3), 30.0), places)):
+        image = cv2.GaussianBlur(picture, (0, 0), 0.7) + rng.normal(0, NOISE, picture.shape)
+        boxes = detector.detect(Frame(image.clip(0, 255).astype(np.uint8), i / rate))
+        if i >= 26:
+            middle = np.add(places[i], np.array(size) / 2 - 0.5)
+            found.append(any(np.abs(each.center_px - middle).max() < 6 for each in boxes))
+    assert np.mean(found) >= FOUND
+
+
+@pytest.mark.parametrize("shift", [0.0, 6.0, -6.0])
+def test_a_box_at_the_images_border_is_clipped_wherever_the_camera_points(shift):
+    rng, rate = np.random.default_rng(12), 25.0
+    detector = BackgroundDetector(LARGE, rate)
+    background = scenery((480, 360), rng)
+    for i in range(12):
+        detector.shift = np.array([0.0 if i < 10 else shift, 0.0])
+        picture = np.roll(background, round(detector.shift[0]), axis=1)
+        if i >= 10:
+            picture[200:260, 440:] = texture(40, 60, rng)
+        noise = rng.normal(0, NOISE, picture.shape)
+        boxes = detector.detect(Frame((picture + noise).clip(0, 255).astype(np.uint8), i / rate))
+    assert [each.clipped for each in boxes if on([each], (459.5, 229.5), 12)] == [True]
+
+
+def test_the_foreground_of_a_camera_that_pans_is_not_that_of_before():
+    rng, rate = np.random.default_rng(13), 25.0
+    detector, background = AutoDetector(rate), scenery((900, 480), rng)
+    for i, picture in enumerate(moved(background, texture(60, 80, rng), [None] * 10 + [(200, 200)] * 30)):
+        left = max(0, 8 * (i - 20))
+        image = picture[:, left : left + 640] + rng.normal(0, NOISE, (480, 640, 3))
+        detector.detect(Frame(image.clip(0, 255).astype(np.uint8), i / rate))
+        if i == 19:
+            assert detector.mask[240, 230] == 255
+    # The target is at another place now.
+    assert cv2.countNonZero(detector.mask[200:280, 200:260]) < 0.1 * 60 * 80
+
+
 def test_a_place_that_is_held_may_lie_outside_the_image():
     """A track near the border, and a camera that has been nudged."""
     rng, rate = np.random.default_rng(8), 25.0
     detector = BackgroundDetector(LARGE, rate)
+    detector.shift = np.array([5.0, 0.0])
     detector.held = [(np.array([u, 100.0]), np.array([10.0, 10.0])) for u in (-300.0, 700.0)]
     picture = scenery((640, 480), rng)
     for i in range(20):

@@ -2,7 +2,10 @@
 
 import math
 
-from benchmarks.real_time import missed, summarise
+import pytest
+
+from benchmarks.frame_sizes import film
+from benchmarks.real_time import LENGTH, ORDER, STREAM, frame_sent, missed, summarise
 
 
 def rows(ages, hz=12.0):
@@ -24,3 +27,11 @@ def test_a_stream_of_which_nothing_was_worked_on_has_no_age():
     summary = summarise(rows([None] * 10))
     assert math.isnan(summary["stream"]["age_p95_ms"])
     assert missed(summary) == ["missed frames", "age"]
+
+
+@pytest.mark.parametrize("late", [0, 1, 5])
+def test_a_frame_is_known_by_its_picture_even_if_others_were_sent_since(late):
+    shown = dict(enumerate(film(STREAM, LENGTH, 0)))
+    birds = [bird for _, bird in shown.values()]
+    for index in (3, 60, 100, len(ORDER) + 10):
+        assert frame_sent(shown[ORDER[index % len(ORDER)]][0].image, index + late, birds) == index

@@ -1,6 +1,11 @@
 """The benchmark of a turn: its figures of hand-made times."""
 
-from benchmarks.turn import Clock, missed, summarise
+import dataclasses
+
+import pytest
+
+from benchmarks.turn import SETTINGS, Clock, missed, one, summarise
+from cotarget.errors import CotargetError
 
 
 def turn(ms, target="bird"):
@@ -32,3 +37,8 @@ def test_a_part_counts_but_not_what_it_calls_in_others():
     assert set(clock.spent) == {"close_up"}
     inner()
     assert clock.spent["rig"] > 0
+
+
+def test_a_target_that_is_never_followed_is_an_error():
+    with pytest.raises(CotargetError, match="bird: was followed in no turn"):
+        one(dataclasses.replace(SETTINGS, targets=("bird",), seconds=0.2), 0)
