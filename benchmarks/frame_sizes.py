@@ -1,4 +1,4 @@
-"""Time and memory of a detector at the frame sizes of today's cameras, and the smallest bird that it finds in them.
+"""Time and memory of a detector at the frame sizes of today's cameras, and whether it finds a bird of 4 px in them.
 
 The film is made: a textured ground under a sky, a bird that crosses the sky, and ten twigs that sway, with the noise of
 a sensor. On each frame, in turns, two things are timed on one thread: `cv2.createBackgroundSubtractorMOG2().apply`
@@ -121,7 +121,7 @@ def print_memory(detector: str, frames: int) -> None:
 
 
 def _largest_mb() -> float:
-    """Largest resident size of this process [MB]; Linux alone tells it since a moment."""
+    """Largest resident size of this process since clear_refs was written [MB], on Linux."""
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return float(status["VmHWM"].split()[0]) / 1024
 

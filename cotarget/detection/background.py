@@ -73,7 +73,7 @@ class BackgroundSettings:
 LEARNING_INTERVAL_S = 0.2
 # Interval at which the background image is read from the mixture, a third of a frame's work [s].
 BACKGROUND_UPDATE_S = 0.25
-# Half the width of a target's edge, along which a target and the place that one has left are told apart [px].
+# Half the width of a target's edge, on which a target is distinguished from the place that one has left [px].
 EDGE_PX = 1
 # Width of the edge from which it is that of a cloud [px], the part of foreground with less difference to the background
 # than counts, and the part of a box with less slope: the edge is as wide as that difference over that slope.

@@ -164,7 +164,7 @@ class Tracker:
 
 @runtime_checkable
 class Registering(Protocol):
-    """A detector that measures the camera's motion, and is told what is followed.
+    """A detector that measures the camera's motion, and takes the confirmed tracks.
 
     Attributes:
         shift: shift of the scene in the last frame since the first (du, dv) [px], (2,).

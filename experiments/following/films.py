@@ -45,7 +45,7 @@ BRIDGE_PX = (3, 3)
 
 @dataclass(frozen=True)
 class FilmsSettings(Settings):
-    """Settings: folders of films with their labels, the detector, what is swept, and at most so many films as seeds."""
+    """Settings: folders of films with their labels, the detector, what is swept, and most films, as seeds."""
 
     seeds: Count = 1000
     folders: tuple[str, ...] = (str(DATA / "flyers"), str(DATA / "birds"))

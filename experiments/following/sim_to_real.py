@@ -56,30 +56,30 @@ STRATA = [", ".join(names) for names in itertools.product(SIZES, CONTRASTS, SPEE
 # larger side in between.
 GAP_PX, RING_PX = 2, (4, 24)
 LEAST_SPREAD = 1.0  # standard deviation that a ring has at least; coding smooths a sky below it [grey levels]
-SPEED_FRAMES = 3  # a speed is measured from so many frames before to as many after
+SPEED_FRAMES = 3  # frames before and after one from which its speed is measured
 
-# Fitted boxes: something contrasts if it differs by so many standard deviations of the ring; it reaches as far as this
-# part of its largest difference and so many standard deviations, over gaps of fewer pixels than the fourth number, and
-# has so many pixels. On made flyers of clear contrast such boxes are 0.4 to 1 px too small, and 0.3 px off.
-SEEN, REACH, ABOVE_NOISE, CLOSED_PX, LEAST_PX = 5.0, 0.2, 2.5, 3, 3
+# Fitted boxes. On made flyers of clear contrast they are 0.4 to 1 px too small, and 0.3 px off.
+SEEN = 5.0  # least difference of a target from the ring [standard deviations of the ring]
+REACH, ABOVE_NOISE = 0.2, 2.5  # the box ends at this part of the largest difference, or at this many deviations
+CLOSED_PX, LEAST_PX = 3, 3  # kernel that closes gaps [px], and fewest pixels of a target
 
-# Made flyers: one of each range of larger sides [px], with this difference to the background [grey levels], speed
-# [larger sides per second], at most so many [px/s], and wing beats [Hz].
+# Made flyers: ranges of the larger side [px], one flyer of each; ranges of the difference to the background [grey
+# levels], the speed [larger sides per second] and the wing beats [Hz]; and the highest speed [px/s].
 SIDES_PX = ((4.0, 12.0), (12.0, 24.0), (24.0, 60.0), (60.0, 120.0))
 DIFFERENCE, FLIGHT, FASTEST_PX_S, BEAT_HZ = (8.0, 100.0), (0.1, 6.0), 400.0, (3.0, 8.0)
 BEAT_RAD = 0.7  # largest angle of a wing
 PATHS = 50  # random paths, of which the one farthest from all labels is taken
 BLUR_PX, FINER = 0.7, 8  # blur of the lens; and by how much finer a flyer is drawn
 
-# Goals, for strata with so many boxes in simulation and fitted films.
-LEAST_FRAMES = 200
+# Goals, and the fewest boxes of a stratum, in simulation and in fitted films each, for which they hold.
+LEAST_BOXES = 200
 RECALL_WITHIN = {"auto": 0.03, "MOG2": 0.08, "KNN": 0.08}
 ERROR_WITHIN_PX = 0.3
 
 
 @dataclass(frozen=True)
 class SimToRealSettings(Settings):
-    """Settings: at most so many films of each kind as seeds, folders of films with labels, and most frames of each."""
+    """Settings: most films of each kind, as seeds, folders of films with labels, and most frames of each."""
 
     seeds: Count = 20
     folders: tuple[str, ...] = films.SETTINGS.folders
@@ -411,7 +411,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     far = []
     for name, kinds in summary.items():
         pair = [kinds[kind] for kind in ("simulation", "fitted") if kind in kinds]
-        if len(pair) < 2 or min(each["frames"] for each in pair) < LEAST_FRAMES:
+        if len(pair) < 2 or min(each["frames"] for each in pair) < LEAST_BOXES:
             continue
         for way, most in RECALL_WITHIN.items():
             for figure, within in ((f"recall {way}", most), (f"error_px {way}", ERROR_WITHIN_PX)):
