@@ -430,8 +430,8 @@ def plot(rows: Sequence[Row], figure: "Figure") -> None:
             recalls = [[each[of][f"recall {way}"] for each in both] for of in ("fitted", kind)]
             axes.scatter(*recalls, [max(3.0, min(each[kind]["frames"], 300) / 5) for each in both], label=kind)
         axes.plot([0, 1], [0, 1], "k:")
-        axes.set(title=way, xlabel="recall, fitted", ylabel="recall")
-        axes.legend()
+        axes.set(title=way, xlabel="recall in film, fitted boxes", ylabel="recall")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
 
 SETTINGS = SimToRealSettings()
