@@ -220,6 +220,9 @@ def run_on_folder(
     """
     results, scores, tiles, minutes = {}, [], [], 0.0
     labels = [read_labels(file) for _, file in films]
+    for film, _ in films:  # an error before the long work, not after it
+        with Film(film):
+            pass
     for i, ((film, _), boxes) in enumerate(zip(films, labels, strict=True)):
         progress(i, len(films), film.stem)
         table = tables / f"{film.stem}.csv"

@@ -317,6 +317,22 @@ def test_labels_of_another_film_are_told_and_not_pooled(folder, capsys):
     assert (pooled["films"], pooled["recall"], pooled["false_tracks"]) == (1, 1.0, 0)
 
 
+def test_labels_of_the_first_frames_alone_are_told(folder, capsys):
+    labels = folder / "films" / "two.csv"
+    labels.write_text("frame,x_px,y_px,width_px,height_px\n29,5,5,9,9\n")
+    assert detect_folder(folder) == 0
+    out, err = capsys.readouterr()
+    assert err.endswith(f"{labels}: no labelled frame is scored; that begins with frame 30\n")
+    assert json.loads(out)["films"]["two"]["recall"] is None
+
+
+def test_a_film_that_cannot_be_read_is_refused_before_the_others_are_searched(folder, capsys):
+    (folder / "films" / "two.mp4").write_text("no film")
+    assert detect_folder(folder) == 1
+    assert "two.mp4" in capsys.readouterr().err
+    assert not list((folder / "tables").iterdir())
+
+
 @pytest.mark.parametrize(("labels", "more", "named"), [
     ("tables", (), "one.mp4: has no labels; give"),
     ("films/one.csv", (), "--labels: .*one.csv is no folder"),

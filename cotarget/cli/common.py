@@ -154,12 +154,16 @@ def scores_of(
     if labels is None:
         return {}
     score = score_tracks(tracks, labels, rate_hz, frames, criterion=criterion or Criterion())
-    warn_beyond_end(file, score.labels_beyond_end, len(labels), frames - 1, whole=whole)
+    warn_unscored(file, score.labels_beyond_end, score.labelled_frames, len(labels), frames - 1, whole=whole)
     return dataclasses.asdict(score)
 
 
-def warn_beyond_end(file: Path | None, beyond: int, labelled: int, last: int, *, whole: bool) -> None:
-    """Warn on stderr of labelled frames beyond a film's last one, if there are any."""
+def warn_unscored(file: Path | None, beyond: int, scored: int, labelled: int, last: int, *, whole: bool) -> None:
+    """Warn on stderr of labelled frames beyond a film's last one, or if all are among the first, which do not count."""
+    from cotarget.track_metrics import LEARNING_FRAMES
+
+    if not beyond and not scored:
+        print(f"{file}: no labelled frame is scored; that begins with frame {LEARNING_FRAMES}", file=sys.stderr)
     if beyond:
         print(
             f"{file}: {beyond} of {labelled} labelled frames are beyond the last one, {last}, and are not counted"

@@ -19,8 +19,8 @@ from cotarget.cli.common import (
     progress_bar,
     rig_files,
     scores_of,
-    warn_beyond_end,
     warn_shortfall,
+    warn_unscored,
 )
 from cotarget.errors import ConfigError
 from cotarget.files import STDOUT
@@ -184,7 +184,12 @@ def detect_command(options: argparse.Namespace) -> None:
     config = RigConfig() if options.rig is None else load_config(options.rig)
     with naming("--target"):
         target = config.target(options.target)
-    criterion = Criterion(options.iou, options.small_px)
+    criterion = Criterion()
+    for name, option in (("iou", "--iou"), ("small_px", "--small-px")):
+        value = getattr(options, name)
+        if value is not None and options.labels is None:
+            raise ConfigError(f"{option}: says when a track is on one of --labels, which are missing")
+        criterion = criterion if value is None else dataclasses.replace(criterion, **{name: value})
     if options.film.is_dir():
         _detect_in_folder(options, target, criterion)
         return
@@ -233,7 +238,8 @@ def _detect_in_folder(options: argparse.Namespace, target: "TargetProfile", crit
         one, labelled = found["films"][film.stem], len(read_labels(file))
         warn_shortfall(film, one["shortfall"])
         whole = one["shortfall"] is None
-        warn_beyond_end(file, one["labels_beyond_end"], labelled, one["last_frame"], whole=whole)
+        beyond, scored = one["labels_beyond_end"], one["labelled_frames"]
+        warn_unscored(file, beyond, scored, labelled, one["last_frame"], whole=whole)
 
 
 def doctor_command(options: argparse.Namespace) -> int:

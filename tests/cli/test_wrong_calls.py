@@ -44,6 +44,7 @@ FILES = {
     "list.json": "[1, 2]",
     "text.mp4": "no film",
     "other.csv": "a,b\n1,2\n",
+    "cut.txt": "31,1,5,5,9,9\n",
     "late.csv": "frame,x_px,y_px,width_px,height_px\n900,1,2,3,4\n",
     **dict.fromkeys(("out.json", "out.csv", "out.mp4"), OLD),
     "index/index.json": '{"schema": 1, "board": 5, "pitch_mm": null, "captures": [1]}',
@@ -162,6 +163,9 @@ CALLS = [
     (f"{DETECT} none/new.csv", FAILED, "none/new.csv"),
     (f"{DETECT} new.csv --labels other.csv", FAILED, "other.csv", "frame, x_px"),
     (f"{DETECT} new.csv --video new.txt", FAILED, "new.txt", ".mp4"),
+    (f"{DETECT} new.csv --labels cut.txt", FAILED, "cut.txt", "line 1 is cut off; it wants frame, id, left"),
+    (f"{DETECT} new.csv --iou 0.5", FAILED, "--iou", "--labels"),
+    (f"{DETECT} new.csv --small-px 9", FAILED, "--small-px", "--labels"),
     (f"{DETECT} - --labels late.csv", FAILED, "--labels", "--csv"),
     ("doctor --rig typo.toml", FAILED, "typo.toml", "sim.scenery"),
 ]
