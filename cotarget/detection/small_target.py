@@ -633,7 +633,8 @@ USUAL_TIMES, USUAL_GAIN, SWAY_PX = 3.0, 0.02, 5
 # Largest score of a clipped box, which may continue a track but not begin one: half of its surroundings are outside the
 # image, so a swaying twig looks isolated.
 MOST_CLIPPED_SCORE = 0.45
-# Images are halved until they are at most this wide [px]. Targets are outlined in full resolution.
+# Images are halved until they are at most this wide [px]; targets are outlined in full resolution. Smaller images are
+# doubled, as often as they stay within it: a bird of one pixel then fills the finest scale, INNER_PX.
 WIDEST_PX = 960
 # Least span of the history before anything is detected [s].
 WARM_UP_S = AGES_S[1]
@@ -663,10 +664,24 @@ class SmallTargetDetector:
         return [detection for _, detection in self.find(frame)]
 
     def find(self, frame: Frame) -> list[tuple[SmallTarget, Detection]]:
-        """Detect as `detect` does; also return the region of each detection, in full resolution."""
+        """Detect as `detect` does; also return the region of each detection, in the image after its enlargement."""
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+        image, times = _enlarged(grey)
+        found = self._search(image, frame.t)
+        if times == 1:
+            return found
+        self.shift = self.shift / times
+        self.mask = np.asarray(cv2.resize(self.mask, grey.shape[::-1], interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return [
+            (target, replace(each, center_px=(each.center_px + 0.5) / times - 0.5, size_px=each.size_px / times))
+            for target, each in found
+        ]
+
+    def _search(self, grey: Image, t: float) -> list[tuple[SmallTarget, Detection]]:
+        """Find regions in an image, (H, W)."""
+        shape = grey.shape
         finer: list[Image] = []
         while grey.shape[1] > WIDEST_PX:
             finer.append(grey)
@@ -676,9 +691,9 @@ class SmallTargetDetector:
         self.shift = unit * shift
         if self.camera.jumped:
             self._history.clear()
-        references = self._history.references(frame.t)
-        fresh = self._history.add(frame.t, grey, shift)
-        self.mask = np.zeros(frame.image.shape[:2], np.uint8)
+        references = self._history.references(t)
+        fresh = self._history.add(t, grey, shift)
+        self.mask = np.zeros(shape, np.uint8)
         if not fresh or self._history.span < WARM_UP_S:
             return []
         found: list[tuple[SmallTarget, Detection]] = []
@@ -688,7 +703,7 @@ class SmallTargetDetector:
             size = -(-target.size[0] // unit), -(-target.size[1] // unit)
             since = changes(grey, low, size, target.around, shift, self._history.noise, references)
             score = small_target_score(target.signal, since, target.beside)
-            detection = box_detection(*target.low, *target.size, score, frame.image.shape)
+            detection = box_detection(*target.low, *target.size, score, shape)
             if detection.clipped:
                 detection = replace(detection, score=min(detection.score, MOST_CLIPPED_SCORE))
             if detection.score >= self._least_score:
@@ -748,6 +763,16 @@ class SmallTargetDetector:
             if detection.score >= LEAST_SCORE:
                 found.append((target, detection))
         return found
+
+
+def _enlarged(image: Image) -> tuple[Image, int]:
+    """Double an image as often as its larger side stays within WIDEST_PX; return it and the factor."""
+    times = 1
+    while 2 * times * max(image.shape) <= WIDEST_PX:
+        times *= 2
+    if times == 1:
+        return image, 1
+    return np.asarray(cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC), dtype=np.uint8), times
 
 
 def _as_a_whole(
