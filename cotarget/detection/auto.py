@@ -95,7 +95,9 @@ class AutoDetector:
         targets = self._small.find(frame)
         width = self._width = frame.image.shape[1]
         self._steady = self._register(frame.t, width)
-        small = self._clutter.weigh([detection for _, detection in targets], frame.t, width, self._held)
+        small = [detection for _, detection in targets]
+        if not self._small.repeated:  # a repeated frame shows no target, and says nothing of where they usually are
+            small = self._clutter.weigh(small, frame.t, width, self._held)
         if not self._steady:
             return sorted(small, key=lambda each: -each.score)
         self._large.held = self._held

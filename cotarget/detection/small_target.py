@@ -652,6 +652,7 @@ class SmallTargetDetector:
         self.shift: Array = np.zeros(2)  # of the camera since the first frame [px], (2,)
         self._shape: tuple[int, ...] | None = None
         self.mask: Image | None = None
+        self.repeated = False  # whether the last frame repeats the one before
 
     def detect(self, frame: Frame) -> list[Detection]:
         """Detect regions that stand out and change, the best first.
@@ -692,9 +693,9 @@ class SmallTargetDetector:
         if self.camera.jumped:
             self._history.clear()
         references = self._history.references(t)
-        fresh = self._history.add(t, grey, shift)
+        self.repeated = not self._history.add(t, grey, shift)
         self.mask = np.zeros(shape, np.uint8)
-        if not fresh or self._history.span < WARM_UP_S:
+        if self.repeated or self._history.span < WARM_UP_S:
             return []
         found: list[tuple[SmallTarget, Detection]] = []
         arrived: list[tuple[SmallTarget, Detection]] = []

@@ -174,6 +174,23 @@ def test_what_sways_at_one_place_loses_its_score_and_what_flies_through_does_not
     assert clutter.weigh([twig], 10.04, 640, [place])[0].score == 0.6  # a target is followed there
 
 
+def test_frames_that_come_twice_hide_no_clutter():
+    """A leaf that turns at its place scores as in the same film with every frame once."""
+    background = scenery((480, 360), np.random.default_rng(8))
+
+    def scores(times):
+        detector, found = AutoDetector(25.0 * times), []
+        for i in range(100):
+            picture = background.astype(np.uint8)
+            picture[100:106, 200:208] = (40, 220)[i // 3 % 2]
+            first, *_ = [detector.detect(Frame(picture, (i + k / times) / 25)) for k in range(times)]
+            found.append(first)
+        return [max((each.score for each in boxes), default=0.0) for boxes in found[50:]]
+
+    assert max(scores(1)) < 0.4
+    assert scores(2) == pytest.approx(scores(1), abs=0.02)
+
+
 def test_the_place_that_a_target_has_left_is_no_target():
     """A car stood there when the background was learnt; it drives off, and leaves a ghost in the background model."""
     rng, rate = np.random.default_rng(6), 25.0
