@@ -7,7 +7,7 @@ the labelled ones of the Drone-detection-dataset, looked for in ../shared/data b
 """
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from cotarget.detection.background import pieces
 from cotarget.detection.base import box_detection
 from cotarget.files import read_table
 from cotarget.rig import Frame, Image
-from cotarget.track_metrics import Box, Tracked, off_boxes, read_labels, score_tracks
+from cotarget.track_metrics import Box, Label, Tracked, off_boxes, read_labels, score_tracks
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Registering, Tracker, update_tracks
 from cotarget.video import Film
@@ -73,37 +73,46 @@ def jobs(settings: FilmsSettings) -> Sequence[int]:
 
 def one(settings: FilmsSettings, number: int) -> list[Row]:
     """Search a film in every way; give a row for each."""
-    video, file = films(settings)[number]
-    labels, flyers = read_labels(file), unlabelled_flyers(video.stem)
-    with Film(video) as film:
-        frames = list(film)
-        rate = film.rate_hz
-    rows: list[Row] = []
-
-    def add(way: str, threshold: float, area: int, tracks: Iterable[Tracked]) -> None:
-        score = score_tracks(tracks, labels, rate, len(frames))
-        others = score_tracks(off_boxes(tracks, flyers), labels, rate, len(frames))
-        rows.append(
-            {
-                "seed": number,
-                "film": video.stem,
-                "way": way,
-                "threshold": threshold,
-                "smallest_px": area,
-                "boxes": score.boxes,
-                "found": score.found,
-                "false_tracks": score.false_tracks,
-                "no_flyer": others.false_tracks,
-                "minutes": len(frames) / rate / 60,
-            }
-        )
-
-    for least, tracks in detector_tracks(settings.detector, settings.scores, frames, rate).items():
-        add(settings.detector, least, 0, tracks)
+    film = labelled_film(*films(settings)[number])
+    found = detector_tracks(settings.detector, settings.scores, film.frames, film.rate_hz)
+    rows = [film.row(settings.detector, least, 0, tracks) for least, tracks in found.items()]
     for way, threshold in itertools.product(MIXTURES, settings.thresholds):
-        for area, tracks in mixture_tracks(way, threshold, settings.areas_px, frames).items():
-            add(way, threshold, area, tracks)
-    return rows
+        for area, tracks in mixture_tracks(way, threshold, settings.areas_px, film.frames).items():
+            rows.append(film.row(way, threshold, area, tracks))
+    return [{"seed": number, **row} for row in rows]
+
+
+@dataclass(frozen=True)
+class LabelledFilm:
+    """Frames of a film by its name, with their rate [Hz], labels, and boxes of flyers without a label."""
+
+    name: str
+    frames: list[Frame]
+    rate_hz: float
+    labels: dict[int, list[Label]]
+    flyers: dict[int, list[Box]]
+
+    def row(self, way: str, threshold: float, area: int, tracks: Iterable[Tracked]) -> Row:
+        """Score the tracks of a way with a threshold and a smallest area [px]."""
+        score = score_tracks(tracks, self.labels, self.rate_hz, len(self.frames))
+        others = score_tracks(off_boxes(tracks, self.flyers), self.labels, self.rate_hz, len(self.frames))
+        return {
+            "film": self.name,
+            "way": way,
+            "threshold": threshold,
+            "smallest_px": area,
+            "boxes": score.boxes,
+            "found": score.found,
+            "false_tracks": score.false_tracks,
+            "no_flyer": others.false_tracks,
+            "minutes": len(self.frames) / self.rate_hz / 60,
+        }
+
+
+def labelled_film(video: Path, labels: Path) -> LabelledFilm:
+    """Read a film and its labels."""
+    with Film(video) as film:
+        return LabelledFilm(video.stem, list(film), film.rate_hz, read_labels(labels), unlabelled_flyers(video.stem))
 
 
 def unlabelled_flyers(film: str) -> dict[int, list[Box]]:
@@ -149,12 +158,19 @@ def mixture_tracks(
     KNN's threshold is 25 times as large.
     """
     model = MIXTURES[way](500, threshold if way == "MOG2" else 25 * threshold, False)
+    return foreground_tracks(lambda image: np.asarray(model.apply(image), dtype=np.uint8), areas_px, frames)
+
+
+def foreground_tracks(
+    subtract: Callable[[Image], Image], areas_px: Sequence[int], frames: Sequence[Frame]
+) -> dict[int, list[Tracked]]:
+    """Track the components of what a function makes of each image, 255 for foreground, for each smallest area [px]."""
     settings = tracking_settings(replace(DEFAULT_TARGETS["bird"], detector="mog2"))
     size = frames[0].image.shape[1], frames[0].image.shape[0]
     trackers = {area: Tracker(settings, size) for area in areas_px}
     tracks: dict[int, list[Tracked]] = {area: [] for area in areas_px}
     for index, frame in enumerate(frames):
-        found = _components(np.asarray(model.apply(frame.image), dtype=np.uint8))
+        found = _components(subtract(frame.image))
         for area, tracker in trackers.items():
             tracker.update([each for pixels, each in found if pixels >= area], frame.t)
             tracks[area] += _confirmed(tracker, index, frame)
@@ -210,13 +226,13 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """List the numbers of false tracks at which the detector is not ahead of both mixtures."""
-    ours = next(way for way in summary if way not in MIXTURES)
+    """List the numbers of false tracks at which the detector, the first way, is not ahead of the others."""
+    ours, *others = summary
     return [
         name
         for name in summary[ours]
         if f" {FALSE_PER_MIN[-1]:g} " not in name
-        if not summary[ours][name] >= max(summary[way][name] for way in MIXTURES) + AHEAD
+        if not summary[ours][name] >= max(summary[way][name] for way in others) + AHEAD
     ]
 
 
