@@ -289,7 +289,7 @@ def read_table(
             parsers = {**columns, **{name: read for name, read in (optional or {}).items() if name in there}}
             for line, row in enumerate(reader, start=2 if names is None else 1):
                 if None in row.values():
-                    raise ValueError(f"line {line} is cut off; it wants {', '.join(columns)}")
+                    raise ValueError(f"line {line} is cut off; it wants {', '.join(parsers)}")
                 for name, read in parsers.items():
                     try:
                         row[name] = read(row[name])

@@ -322,7 +322,7 @@ def test_labels_of_the_first_frames_alone_are_told(folder, capsys):
     labels.write_text("frame,x_px,y_px,width_px,height_px\n29,5,5,9,9\n")
     assert detect_folder(folder) == 0
     out, err = capsys.readouterr()
-    assert err.endswith(f"{labels}: no labelled frame is scored; that begins with frame 30\n")
+    assert err.endswith(f"{labels}: nothing is scored; all labels are in the first 30 frames\n")
     assert json.loads(out)["films"]["two"]["recall"] is None
 
 

@@ -163,7 +163,7 @@ def warn_unscored(file: Path | None, beyond: int, scored: int, labelled: int, la
     from cotarget.track_metrics import LEARNING_FRAMES
 
     if not beyond and not scored:
-        print(f"{file}: no labelled frame is scored; that begins with frame {LEARNING_FRAMES}", file=sys.stderr)
+        print(f"{file}: nothing is scored; all labels are in the first {LEARNING_FRAMES} frames", file=sys.stderr)
     if beyond:
         print(
             f"{file}: {beyond} of {labelled} labelled frames are beyond the last one, {last}, and are not counted"

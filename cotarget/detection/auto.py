@@ -52,6 +52,8 @@ HELD_S = 60.0
 HELD_MARGIN, HELD_PART = 0.2, 2 / 640
 # Clutter: number of cells along the image's width, memory [s], and the usual score that halves a target's odds.
 CELLS, CLUTTER_S, CLUTTER_EVEN = 80, 10.0, 0.03
+# Largest weight of one image in the clutter map: the first after a pause does not empty it.
+MOST_GAIN = 0.1
 
 
 class AutoDetector:
@@ -188,7 +190,7 @@ class Clutter:
                 even = each.score / (1 + float(self._usual[v, u]) / CLUTTER_EVEN)
                 each = replace(each, score=even / (even + 1 - each.score))
             weighed.append(each)
-        self._usual += min(1.0, max(0.0, (t - self._t) / CLUTTER_S)) * (now - self._usual)
+        self._usual += np.clip((t - self._t) / CLUTTER_S, 0.0, MOST_GAIN) * (now - self._usual)
         self._t = t
         return weighed
 

@@ -84,7 +84,7 @@ def one(settings: FilmsSettings, number: int) -> list[Row]:
 
 @dataclass(frozen=True)
 class LabelledFilm:
-    """Frames of a film by its name, with their rate [Hz], labels, and boxes of flyers without a label."""
+    """A film: its name, frames, frame rate [Hz], labels by frame number, and boxes of flyers without a label."""
 
     name: str
     frames: list[Frame]
@@ -240,7 +240,7 @@ def plot(rows: Sequence[Row], figure: "Figure") -> None:
     """Recall against false tracks a minute, for each threshold and smallest area."""
     axes = figure.subplots()
     for way, points in curves(rows).items():
-        axes.plot(*zip(*sorted(points), strict=True), "o-" if way not in MIXTURES else ".", label=way)
+        axes.plot(*zip(*sorted(points), strict=True), "o-" if way == rows[0]["way"] else ".", label=way)
     axes.set(xscale="symlog", xlabel="false tracks a minute", ylabel="recall", ylim=(0, 1))
     axes.legend()
 

@@ -9,7 +9,7 @@ here.
 import contextlib
 import importlib.util
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,7 +32,7 @@ __all__ = ["missed", "plot", "summarise"]
 WAY, EVERY = "SuBSENSE", 5
 CONFIG = """<?xml version="1.0"?>
 <opencv_storage><fRelLBSPThreshold>0.333</fRelLBSPThreshold><nDescDistThresholdOffset>3</nDescDistThresholdOffset>
-<nMinColorDistThreshold>{threshold:.0f}</nMinColorDistThreshold><nBGSamples>50</nBGSamples>
+<nMinColorDistThreshold>{threshold:g}</nMinColorDistThreshold><nBGSamples>50</nBGSamples>
 <nRequiredBGSamples>2</nRequiredBGSamples><nSamplesForMovingAvgs>100</nSamplesForMovingAvgs>
 <showOutput>0</showOutput></opencv_storage>
 """
@@ -64,28 +64,21 @@ def one(settings: SubsenseSettings, number: int) -> list[Row]:
     found = detector_tracks(settings.detector, settings.scores, film.frames, film.rate_hz)
     rows = [film.row(settings.detector, least, 0, tracks) for least, tracks in found.items()]
     for threshold in settings.thresholds:
-        model = Subsense(threshold)
-        for area, tracks in foreground_tracks(model, settings.areas_px, film.frames).items():
+        for area, tracks in foreground_tracks(subsense(threshold), settings.areas_px, film.frames).items():
             rows.append(film.row(WAY, threshold, area, tracks))
     return [{"seed": number, **row} for row in rows]
 
 
-class Subsense:
-    """SuBSENSE of bgslibrary."""
+def subsense(threshold: float) -> Callable[[Image], Image]:
+    """Make SuBSENSE with a least difference of colour [grey levels]; it gives each image's foreground, 0 or 255."""
+    import pybgs
 
-    def __init__(self, threshold: float) -> None:
-        """Start without a background; ``threshold`` is the least difference of colour [grey levels]."""
-        import pybgs
-
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-            path = Path("config", f"{WAY}.xml")
-            path.parent.mkdir()
-            path.write_text(CONFIG.format(threshold=threshold))
-            self._model = pybgs.SuBSENSE()
-
-    def __call__(self, image: Image) -> Image:
-        """Give the foreground of the next image, (H, W), 0 or 255."""
-        return np.asarray(self._model.apply(image), dtype=np.uint8)
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        path = Path("config", f"{WAY}.xml")
+        path.parent.mkdir()
+        path.write_text(CONFIG.format(threshold=threshold))
+        model = pybgs.SuBSENSE()
+    return lambda image: np.asarray(model.apply(image), dtype=np.uint8)
 
 
 SETTINGS = SubsenseSettings()

@@ -172,6 +172,8 @@ def test_what_sways_at_one_place_loses_its_score_and_what_flies_through_does_not
             assert scores == {300: pytest.approx(0.6), 100: pytest.approx(0.6)}
     assert scores == {300: pytest.approx(0.1, abs=0.01), 100: pytest.approx(0.5, abs=0.02)}
     assert clutter.weigh([twig], 10.04, 640, [place])[0].score == 0.6  # a target is followed there
+    clutter.weigh([], 30.0, 640, [])  # the first image after a pause
+    assert clutter.weigh([twig], 30.04, 640, [])[0].score < 0.15
 
 
 def test_frames_that_come_twice_hide_no_clutter():
