@@ -184,12 +184,9 @@ def detect_command(options: argparse.Namespace) -> None:
     config = RigConfig() if options.rig is None else load_config(options.rig)
     with naming("--target"):
         target = config.target(options.target)
-    criterion = Criterion()
-    for name, option in (("iou", "--iou"), ("small_px", "--small-px")):
-        value = getattr(options, name)
-        if value is not None and options.labels is None:
-            raise ConfigError(f"{option}: says when a track is on one of --labels, which are missing")
-        criterion = criterion if value is None else dataclasses.replace(criterion, **{name: value})
+    criterion = Criterion(options.iou, options.small_px)
+    if options.labels is None and criterion != Criterion():
+        raise ConfigError("--iou, --small-px: compare tracks with --labels, which are missing")
     if options.film.is_dir():
         _detect_in_folder(options, target, criterion)
         return

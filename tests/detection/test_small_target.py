@@ -292,6 +292,14 @@ def test_a_bird_alone_in_the_sky_is_not_taken_for_the_cameras_motion():
         assert np.abs(track.center_px - (60 + 3 * i, 80)).max() < 5
 
 
+def test_a_cut_finds_nothing_until_the_new_scene_has_been_seen_for_a_while():
+    def paint(picture, i):
+        draw(picture, 220, 80, 8, 5)
+
+    found = watch(film(30, paint, seed=8) + film(30, paint, seed=9))
+    assert not any(box.score > 0.5 for boxes in found[30:] for box in boxes)
+
+
 def test_after_a_cut_what_stands_is_no_target_and_what_flies_is_one_soon():
     def paint(picture, i):
         draw(picture, 220, 80, 8, 5)
