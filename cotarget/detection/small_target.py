@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detection, box_detection, check_size, is_clipped, moved
+from cotarget.detection.base import Detection, box_detection, check_size, moved
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
@@ -633,8 +633,7 @@ USUAL_TIMES, USUAL_GAIN, SWAY_PX = 3.0, 0.02, 5
 # Largest score of a clipped box, which may continue a track but not begin one: half of its surroundings are outside the
 # image, so a swaying twig looks isolated.
 MOST_CLIPPED_SCORE = 0.45
-# Images are halved until they are at most this wide [px]; targets are outlined in full resolution. Images whose
-# doubled sides are within it are doubled: a bird of one pixel then fills more of the finest scale, INNER_PX.
+# Images are halved until they are at most this wide [px]. Targets are outlined in full resolution.
 WIDEST_PX = 960
 # Least span of the history before anything is detected [s].
 WARM_UP_S = AGES_S[1]
@@ -665,36 +664,22 @@ class SmallTargetDetector:
         return [detection for _, detection in self.find(frame)]
 
     def find(self, frame: Frame) -> list[tuple[SmallTarget, Detection]]:
-        """Detect as `detect` does; also return the region of each detection, in the image as it is searched."""
+        """Detect as `detect` does; also return the region of each detection, in full resolution."""
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
-        if 2 * max(grey.shape) > WIDEST_PX:
-            return self._search(grey, frame.t)
-        doubled = np.asarray(cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
-        found = self._search(doubled, frame.t, grey)
-        self.shift = self.shift / 2
-        self.mask = np.asarray(cv2.resize(self.mask, grey.shape[::-1], interpolation=cv2.INTER_AREA), dtype=np.uint8)
-        return [
-            (target, replace(each, center_px=(each.center_px + 0.5) / 2 - 0.5, size_px=each.size_px / 2))
-            for target, each in found
-        ]
-
-    def _search(self, grey: Image, t: float, half: Image | None = None) -> list[tuple[SmallTarget, Detection]]:
-        """Find regions in an image, (H, W); ``half`` is the one that it was doubled from."""
-        shape, rim = grey.shape, 0 if half is None else 1
         finer: list[Image] = []
         while grey.shape[1] > WIDEST_PX:
             finer.append(grey)
             grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         unit = 2 ** len(finer)
-        shift = self.camera.update(grey) if half is None else 2 * self.camera.update(half)
+        shift = self.camera.update(grey)
         self.shift = unit * shift
         if self.camera.jumped:
             self._history.clear()
-        references = self._history.references(t)
-        self.repeated = not self._history.add(t, grey, shift)
-        self.mask = np.zeros(shape, np.uint8)
+        references = self._history.references(frame.t)
+        self.repeated = not self._history.add(frame.t, grey, shift)
+        self.mask = np.zeros(frame.image.shape[:2], np.uint8)
         if self.repeated or self._history.span < WARM_UP_S:
             return []
         found: list[tuple[SmallTarget, Detection]] = []
@@ -704,12 +689,14 @@ class SmallTargetDetector:
             size = -(-target.size[0] // unit), -(-target.size[1] // unit)
             since = changes(grey, low, size, target.around, shift, self._history.noise, references)
             score = small_target_score(target.signal, since, target.beside)
-            detection = _boxed(target, score, shape, rim)
+            detection = box_detection(*target.low, *target.size, score, frame.image.shape)
+            if detection.clipped:
+                detection = replace(detection, score=min(detection.score, MOST_CLIPPED_SCORE))
             if detection.score >= self._least_score:
                 found.append((target, detection))
             if detection.score >= BELIEVED_SCORE and np.nanmax(since) >= ARRIVED:
                 arrived.append((target, detection))
-        differing = self._differing(grey, unit, shift, references, rim)
+        differing = self._differing(grey, unit, shift, references)
         found = _best_of(found + [_as_a_whole(pair, arrived) for pair in differing])
         for target, detection in reversed(found):
             (x, y), (w, h) = target.low, target.size
@@ -717,7 +704,7 @@ class SmallTargetDetector:
         return found
 
     def _differing(
-        self, grey: Image, unit: int, shift: Array, references: list[tuple[Image, Array] | None], rim: int
+        self, grey: Image, unit: int, shift: Array, references: list[tuple[Image, Array] | None]
     ) -> list[tuple[SmallTarget, Detection]]:
         """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved."""
         earlier = [kept for kept in references if kept is not None]
@@ -755,18 +742,13 @@ class SmallTargetDetector:
             target = replace(
                 target, low=(unit * (left + x), unit * (top + y)), size=(unit * w, unit * h), beside=math.inf
             )
-            detection = _boxed(target, score, (unit * grey.shape[0], unit * grey.shape[1]), rim)
+            shape = unit * grey.shape[0], unit * grey.shape[1]
+            detection = box_detection(*target.low, *target.size, score, shape)
+            if detection.clipped:
+                detection = replace(detection, score=min(score, MOST_CLIPPED_SCORE))
             if detection.score >= LEAST_SCORE:
                 found.append((target, detection))
         return found
-
-
-def _boxed(target: SmallTarget, score: float, shape: tuple[int, ...], rim: int) -> Detection:
-    """Make a detection of a region; one that is as near to the border as ``rim`` [px] is clipped."""
-    box = box_detection(*target.low, *target.size, score, shape)
-    if is_clipped(box.center_px, box.size_px + 2 * rim, shape):
-        return replace(box, score=min(score, MOST_CLIPPED_SCORE), clipped=True)
-    return box
 
 
 def _as_a_whole(
