@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detection, box_detection, check_size, moved
+from cotarget.detection.base import Detection, box_detection, check_size, is_clipped, moved
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
@@ -633,8 +633,13 @@ USUAL_TIMES, USUAL_GAIN, SWAY_PX = 3.0, 0.02, 5
 # Largest score of a clipped box, which may continue a track but not begin one: half of its surroundings are outside the
 # image, so a swaying twig looks isolated.
 MOST_CLIPPED_SCORE = 0.45
-# Images are halved until they are at most this wide [px]. Targets are outlined in full resolution.
-WIDEST_PX = 960
+# Images are halved until they are at most this wide [px]; targets are outlined in full resolution. Small images are
+# doubled while their larger side stays within it, at most twice: a bird of one pixel then fills more of the finest
+# scale, INNER_PX.
+WIDEST_PX, MOST_TIMES = 960, 4
+# Least contrast in an image that was doubled twice and has more noise than LEAST_ROUGHNESS: its finest scale lies within
+# one pixel of the camera, so the mean does not reduce the noise.
+NOISY_SIGNAL = 5.5
 # Least span of the history before anything is detected [s].
 WARM_UP_S = AGES_S[1]
 
@@ -664,7 +669,7 @@ class SmallTargetDetector:
         return [detection for _, detection in self.find(frame)]
 
     def find(self, frame: Frame) -> list[tuple[SmallTarget, Detection]]:
-        """Detect as `detect` does; also return the region of each detection, in full resolution."""
+        """Detect as `detect` does; also return the region of each detection, in the enlarged image of a small one."""
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
@@ -673,8 +678,10 @@ class SmallTargetDetector:
             finer.append(grey)
             grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         unit = 2 ** len(finer)
-        shift = self.camera.update(grey)
+        shift = self.camera.update(grey)  # measured without enlargement, in which soft scenes have no corners
         self.shift = unit * shift
+        grey, times = _enlarged(grey)
+        shift = times * shift
         if self.camera.jumped:
             self._history.clear()
         references = self._history.references(frame.t)
@@ -682,31 +689,35 @@ class SmallTargetDetector:
         self.mask = np.zeros(frame.image.shape[:2], np.uint8)
         if self.repeated or self._history.span < WARM_UP_S:
             return []
+        shape = tuple(times * side for side in frame.image.shape[:2])
         found: list[tuple[SmallTarget, Detection]] = []
         arrived: list[tuple[SmallTarget, Detection]] = []
-        for target in find_small_targets(grey, LEAST_SIGNAL, MOST_TARGETS, finer=finer):
+        noisy = times == MOST_TIMES and self._history.noise > LEAST_ROUGHNESS
+        for target in find_small_targets(grey, NOISY_SIGNAL if noisy else LEAST_SIGNAL, MOST_TARGETS, finer=finer):
             low = target.low[0] // unit, target.low[1] // unit
             size = -(-target.size[0] // unit), -(-target.size[1] // unit)
             since = changes(grey, low, size, target.around, shift, self._history.noise, references)
             score = small_target_score(target.signal, since, target.beside)
-            detection = box_detection(*target.low, *target.size, score, frame.image.shape)
-            if detection.clipped:
-                detection = replace(detection, score=min(detection.score, MOST_CLIPPED_SCORE))
+            detection = _boxed(target, score, shape, times)
             if detection.score >= self._least_score:
                 found.append((target, detection))
             if detection.score >= BELIEVED_SCORE and np.nanmax(since) >= ARRIVED:
                 arrived.append((target, detection))
-        differing = self._differing(grey, unit, shift, references)
+        differing = self._differing(grey, unit, times, shift, references)
         found = _best_of(found + [_as_a_whole(pair, arrived) for pair in differing])
         for target, detection in reversed(found):
             (x, y), (w, h) = target.low, target.size
-            self.mask[y : y + h, x : x + w] = round(255 * detection.score)
+            rows, columns = slice(y // times, -(-(y + h) // times)), slice(x // times, -(-(x + w) // times))
+            self.mask[rows, columns] = round(255 * detection.score)
         return found
 
     def _differing(
-        self, grey: Image, unit: int, shift: Array, references: list[tuple[Image, Array] | None]
+        self, grey: Image, unit: int, times: int, shift: Array, references: list[tuple[Image, Array] | None]
     ) -> list[tuple[SmallTarget, Detection]]:
-        """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved."""
+        """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
+
+        That of an image enlarged so many ``times`` is halved, because in it a twig sways over more pixels.
+        """
         earlier = [kept for kept in references if kept is not None]
         if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > SHAKING_PX for _, then in earlier):
             self._usual = None
@@ -716,8 +727,12 @@ class SmallTargetDetector:
             for picture, then in earlier
         )
         difference = functools.reduce(cv2.min, (cv2.absdiff(grey, picture) for picture in registered))
+        pixel = unit  # side of a pixel of the difference
+        if times > 1:
+            pixel = 2
+            difference = cv2.resize(difference, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         if self._usual is None:
-            self._usual = np.zeros(grey.shape, np.float32)
+            self._usual = np.zeros(difference.shape, np.float32)
         usual = cv2.dilate(cv2.convertScaleAbs(self._usual, alpha=USUAL_TIMES), np.ones((SWAY_PX, SWAY_PX), np.uint8))
         cv2.accumulateWeighted(difference, self._usual, USUAL_GAIN)
         unusual = cv2.subtract(difference, usual)
@@ -740,15 +755,32 @@ class SmallTargetDetector:
             score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE)) if target.contrast > 0 else 0.0
             (x, y), (w, h) = target.low, target.size
             target = replace(
-                target, low=(unit * (left + x), unit * (top + y)), size=(unit * w, unit * h), beside=math.inf
+                target, low=(pixel * (left + x), pixel * (top + y)), size=(pixel * w, pixel * h), beside=math.inf
             )
-            shape = unit * grey.shape[0], unit * grey.shape[1]
-            detection = box_detection(*target.low, *target.size, score, shape)
-            if detection.clipped:
-                detection = replace(detection, score=min(score, MOST_CLIPPED_SCORE))
+            detection = _boxed(target, score, (unit * grey.shape[0], unit * grey.shape[1]), times)
             if detection.score >= LEAST_SCORE:
                 found.append((target, detection))
         return found
+
+
+def _enlarged(grey: Image) -> tuple[Image, int]:
+    """Double an image while its larger side stays within WIDEST_PX; return it, and how many times as large it is."""
+    times = 1
+    while times < MOST_TIMES and 2 * times * max(grey.shape) <= WIDEST_PX:
+        times *= 2
+    if times == 1:
+        return grey, times
+    enlarged = cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+    return np.asarray(enlarged, dtype=np.uint8), times
+
+
+def _boxed(target: SmallTarget, score: float, shape: tuple[int, ...], times: int) -> Detection:
+    """Make a detection of a region of an image of a shape (H, W), so many ``times`` as large as the camera's."""
+    box = box_detection(*target.low, *target.size, score, shape)
+    # Interpolation blurs the camera's last pixel over as many as it is enlarged.
+    if is_clipped(box.center_px, box.size_px + 2 * (times - 1), shape):
+        box = replace(box, score=min(score, MOST_CLIPPED_SCORE), clipped=True)
+    return replace(box, center_px=(box.center_px + 0.5) / times - 0.5, size_px=box.size_px / times)
 
 
 def _as_a_whole(

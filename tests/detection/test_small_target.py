@@ -179,6 +179,42 @@ def test_a_bird_in_front_of_rough_ground_is_found_by_what_it_does_to_the_picture
     assert sum(len(confirmed) > 1 for confirmed in tracks) <= 0.1 * 80  # it may fall in two for a moment
 
 
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_a_bird_of_a_pixel_is_found_in_a_small_picture(times):
+    """A film in half and a third of its size: the bird is 1.3 px long."""
+
+    def paint(picture, i):
+        draw(picture, *at(i), 4, 3, grey=110.0)
+
+    def at(i):
+        return 40 + 3 * i, 60 + i / 2
+
+    size = WIDTH // times, HEIGHT // times
+    part = np.divide(size, (WIDTH, HEIGHT))
+    detector = SmallTargetDetector()
+    found = watch([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in film(80, paint)], detector)
+    assert detector.mask.shape == size[::-1]
+    u, v = found[-1][0].center_px
+    assert detector.mask[round(v), round(u)] > 100
+    off = []
+    for i in range(30, 80):
+        place = (np.array(at(i)) + 0.5) * part - 0.5
+        off.append(min((np.linalg.norm(each.center_px - place) for each in found[i]), default=np.inf))
+    assert np.mean(np.array(off) < 0.7) > 0.9
+    assert np.median(off) < 0.2
+
+
+@pytest.mark.parametrize(("width", "height"), [(160, 120), (240, 180), (320, 240), (640, 480)])
+@pytest.mark.parametrize("noise", [2.0, 4.0, 8.0])
+def test_noise_alone_makes_no_track(width, height, noise):
+    """Small pictures are enlarged before they are searched, and their noise with them."""
+    rng = np.random.default_rng(1)
+    pictures = [np.clip(128 + rng.normal(0, noise, (height, width, 3)), 0, 255).astype(np.uint8) for _ in range(60)]
+    tracker = Tracker(tracking_settings(SPECK), (width, height))
+    for i, found in enumerate(watch(pictures)):
+        assert not any(track.confirmed for track in tracker.update(found, i / RATE))
+
+
 def test_a_twig_that_sways_where_it_is_makes_no_track():
     """Above the ground's rough edge, hither and thither by its own size as the wind takes it."""
     rng = np.random.default_rng(7)
