@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
-from annotated_types import Ge, Interval, Le
+from annotated_types import Ge, Gt, Interval, Le
 
 from cotarget.errors import ConfigError, choices
 from cotarget.files import assets_dir
@@ -405,7 +405,7 @@ class WrittenBoard:
         return BoardConfig(self.kind, self.corners, self.square)
 
 
-DETECTORS = ("auto", "colour", "motion", "speck", "mog2")
+DETECTORS = ("auto", "colour", "motion", "speck", "mog2", "onnx")
 
 
 def _detector(name: str) -> str:
@@ -415,8 +415,34 @@ def _detector(name: str) -> str:
 
 
 DetectorName = Annotated[
-    str, '"auto", "colour", "motion", "speck", "mog2" or "module:function"', Check(_detector), InFolder(locate)
+    str, '"auto", "colour", "motion", "speck", "mog2", "onnx" or "module:function"', Check(_detector), InFolder(locate)
 ]
+
+
+@model
+class NetworkConfig:
+    """A neural network that finds targets.
+
+    Attributes:
+        model: ONNX file with an input of 1 x 3 x height x width, RGB; relative to rig.toml.
+        layout: how it writes boxes: "yolo" (YOLOv8 and later), "yolov5" (with a score for any target), "yolov10"
+            (corners, score and class), "ssd" (boxes, labels and scores), "detr", or "rtdetr" (no logit for no target).
+        input_px: size of its input [px]; that of the file by default.
+        classes: numbers of the classes that are the target; all by default.
+        least_score: least score of a detection.
+        tiled: whether images larger than the input are also searched in tiles at full resolution, for small targets.
+        mean: level of each channel that is subtracted from the image, red first.
+        std: level of each channel that the difference is divided by.
+    """
+
+    model: Annotated[NotEmptyPath, InFolder(lambda path, folder: (folder / path).absolute())]
+    layout: Literal["yolo", "yolov5", "yolov10", "ssd", "detr", "rtdetr"] = "yolo"
+    input_px: Size | None = None
+    classes: tuple[Annotated[int, Ge(0)], ...] = ()
+    least_score: Annotated[float, Gt(0), Le(1)] = 0.25
+    tiled: bool = False
+    mean: Annotated[tuple[float, float, float], "[red, green, blue]"] = (0.0, 0.0, 0.0)
+    std: Annotated[tuple[Positive, Positive, Positive], "[red, green, blue]"] = (255.0, 255.0, 255.0)
 
 
 @model
@@ -429,11 +455,12 @@ class TargetProfile:
         wanted_px: size of that dimension in the close-up [px].
         detector: how the fixed camera's images are searched: "auto" finds what moves or stands out, from a few pixels
             to half the image, "colour" matches a template, "motion" subtracts the background, "speck" finds
-            small targets by contrast and change, "mog2" is the paper's plain background subtraction; or a function of
-            your own from an image to boxes, in a module beside rig.toml or on Python's path.
+            small targets by contrast and change, "mog2" is the paper's plain background subtraction, "onnx" is a neural
+            network; or a function of your own from an image to boxes, in a module beside rig.toml or on Python's path.
         template: picture of the target, cut to its outline, for the detector "colour"; relative to rig.toml.
         motion: motion model; "general" covers anything that moves by itself.
         shape: expected width over height of the target's box; none if it is unknown or changes.
+        network: the network of the detector "onnx".
     """
 
     size: Positive
@@ -443,6 +470,7 @@ class TargetProfile:
     template: FilePath | None = None
     motion: Literal["standing", "walking", "flying", "general"] = "general"
     shape: Positive | None = None
+    network: NetworkConfig | None = None
 
     @property
     def matcher(self) -> Literal["box", "upright", "outline"]:

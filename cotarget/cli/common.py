@@ -59,9 +59,11 @@ def open_named(path: Path, config: "RigConfig", guarded: bool = True) -> "Rig":
 def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:
     """List the files and folders that opening a rig reads: rig.toml and those that it names. None may be an output."""
     scene = Path(config.sim.scene)
-    templates = [target.template for target in config.targets.values()]
+    targets = config.targets.values()
+    templates = [target.template for target in targets]
+    networks = [target.network.model for target in targets if target.network is not None]
     own = scene if scene.is_file() else None
-    return [rig, config.safety.stop_file, config.recording, own, *config.sim.models.values(), *templates]
+    return [rig, config.safety.stop_file, config.recording, own, *config.sim.models.values(), *templates, *networks]
 
 
 def check_board_size(rig: Path, config: "RigConfig") -> None:

@@ -250,6 +250,7 @@ NEEDED = {
     "motion": "what --target names has to move",
     "mog2": "what --target names has to move",
     "speck": "what --target names has to move",
+    "onnx": "what --target names has to be of network.classes, with a score of network.least_score",
 }
 
 

@@ -1,10 +1,10 @@
 """Detect targets in the fixed camera: of any kind, by colour (a book), by motion (a person), by contrast (a bird).
 
-`make_detector` makes one of five by name: "auto", which finds what moves or stands out, of any size; "colour";
+`make_detector` makes one of six by name: "auto", which finds what moves or stands out, of any size; "colour";
 "mog2", the paper's adaptive Gaussian mixture, with its foreground cleaned and joined to regions of a target's size;
-"motion", the same mixture made robust against foliage and light; and "speck", for small targets that may hover, seen by
-a camera that may shake. `ExternalDetector` makes a detector of any function from an image to boxes; the name
-"module:function" stands for one of a user's own.
+"motion", the same mixture made robust against foliage and light; "speck", for small targets that may hover, seen by
+a camera that may shake; and "onnx", a neural network. `ExternalDetector` makes a detector of any function from an image
+to boxes; the name "module:function" stands for one of a user's own.
 """
 
 import cv2
@@ -15,6 +15,7 @@ from cotarget.detection.auto import AutoDetector
 from cotarget.detection.background import BIRD, GENERAL, PERSON, BackgroundDetector, BackgroundSettings, plain
 from cotarget.detection.base import Detection, Detector, ExternalDetector
 from cotarget.detection.color_template import ColorTemplateDetector
+from cotarget.detection.network import Network
 from cotarget.detection.small_target import SmallTargetDetector
 from cotarget.errors import ConfigError
 from cotarget.plugins import is_own, load, reporting
@@ -46,12 +47,17 @@ def make_detector(target: TargetProfile, rate_hz: float, template: Image | None 
         template: image of the target for the detector "colour", (h, w, 3) BGR; that of the target profile by default.
 
     Raises:
-        ConfigError: a colour target has no usable template, or a detector of the user's own cannot be imported.
+        ConfigError: a colour target has no usable template, a network cannot be run, or a detector of the user's own
+            cannot be imported.
     """
     kind = target.detector
     if is_own(kind):
         where = f"detector '{kind}'"
         return ExternalDetector(reporting(load(kind, where), where))
+    if kind == "onnx":
+        if target.network is None:
+            raise ConfigError('a target with detector = "onnx" needs a table "network" with model = "network.onnx"')
+        return ExternalDetector(Network(target.network))
     if kind == "auto":
         return AutoDetector(rate_hz)
     if kind == "speck":

@@ -637,8 +637,8 @@ MOST_CLIPPED_SCORE = 0.45
 # doubled while their larger side stays within it, at most twice: a bird of one pixel then fills more of the finest
 # scale, INNER_PX.
 WIDEST_PX, MOST_TIMES = 960, 4
-# Least contrast in an image that was doubled twice and has more noise than LEAST_ROUGHNESS: its finest scale lies within
-# one pixel of the camera, so the mean does not reduce the noise.
+# Least contrast in an image that was doubled twice and has more noise than LEAST_ROUGHNESS: its finest scale lies
+# within one pixel of the camera, so the mean does not reduce the noise.
 NOISY_SIGNAL = 5.5
 # Least span of the history before anything is detected [s].
 WARM_UP_S = AGES_S[1]

@@ -1,0 +1,257 @@
+"""Networks built by hand, whose boxes are known: each finds what is red, green and blue, as classes 0, 1 and 2."""
+
+import builtins
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.config import DEFAULT_TARGETS, NetworkConfig, parse_config
+from cotarget.detection import make_detector
+from cotarget.errors import ConfigError
+from cotarget.rig import Frame
+
+onnx = pytest.importorskip("onnx")
+
+SIDE = 96, 64  # width and height of the networks' input
+SCORES = 0.9, 0.8, 0.7  # of the classes
+LAYOUTS = ["yolo", "yolov5", "yolov10", "ssd", "ssd rows", "detr", "rtdetr"]
+
+
+class Graph:
+    """An ONNX graph that is written line by line."""
+
+    def __init__(self, side=SIDE, channels=3):
+        self.nodes, self.constants = [], []
+        self.input = [1, channels, side[1], side[0]]
+
+    def const(self, value, dtype=np.float32):
+        name = f"constant{len(self.constants)}"
+        self.constants.append(onnx.numpy_helper.from_array(np.array(value, dtype), name))
+        return name
+
+    def __call__(self, op, *inputs, name=None, **attributes):
+        name = name or f"{op}{len(self.nodes)}"
+        inputs = [each if isinstance(each, str) else self.const(each) for each in inputs]
+        self.nodes.append(onnx.helper.make_node(op, inputs, [name], **attributes))
+        return name
+
+    def save(self, path, **outputs):
+        """Write the file; the outputs by their shapes."""
+        infos = [onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, self.input)] + [
+            onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape) for name, shape in outputs.items()
+        ]
+        graph = onnx.helper.make_graph(self.nodes, "graph", infos[:1], infos[1:], self.constants)
+        opset = [onnx.helper.make_opsetid("", 13)]
+        onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=8), path)
+        return path
+
+
+def edges(g, side):
+    """Corners of what is above half of full brightness in each channel, as (1, 3, 1) each, and scores, (1, 3, 1)."""
+    found = []
+    for axis, n in ((2, side[0]), (3, side[1])):  # what remains after the other axis is reduced
+        line = g("ReduceMax", "x", axes=[axis], keepdims=0)
+        lit = g("Clip", g("Mul", g("Sub", line, 0.5), 1000.0), 0.0, 1.0)
+        last = g("ReduceMax", g("Mul", lit, [[np.arange(1, n + 1)]]), axes=[2], keepdims=1)
+        first = g("Sub", float(n), g("ReduceMax", g("Mul", lit, [[np.arange(n, 0, -1)]]), axes=[2], keepdims=1))
+        found.append((first, last, g("ReduceMax", lit, axes=[2], keepdims=1)))
+    (left, right, seen), (top, bottom, _) = found
+    return left, top, right, bottom, g("Mul", seen, np.reshape(SCORES, (1, 3, 1)))
+
+
+def network(path, layout, side=SIDE, names=("boxes", "labels", "scores")):
+    """Write a network of a layout."""
+    g = Graph(side)
+    left, top, right, bottom, score = edges(g, side)
+    centers = [g("Mul", g("Add", a, b), 0.5) for a, b in ((left, right), (top, bottom))]
+    sizes = [g("Sub", b, a) for a, b in ((left, right), (top, bottom))]
+    classes = g("Mul", score, [np.eye(3)])
+    if layout in ("yolo", "yolov5"):
+        objectness = [score] if layout == "yolov5" else []
+        each = np.eye(3)[None] if objectness else classes
+        rows = g("Concat", *centers, *sizes, *objectness, each, axis=2)
+        columns = (1, 1, 7 + len(objectness))
+        further, worse = np.zeros(columns), np.ones(columns)
+        further[..., :2], worse[..., 4] = 0.5, 0.9
+        worse[..., 4:] = worse[..., 4:5]
+        again = g("Mul", g("Add", rows, further), worse)  # every target is found twice, half a pixel further
+        twice = g("Concat", again, rows, axis=1, name=None if layout == "yolo" else "output")
+        if layout == "yolo":
+            g("Transpose", twice, perm=[0, 2, 1], name="output")
+            return g.save(path, output=[1, 7, 6])
+        return g.save(path, output=[1, 6, 8])
+    numbers = np.arange(3.0).reshape(1, 3, 1)
+    if layout == "yolov10":
+        g("Concat", left, top, right, bottom, score, numbers, axis=2, name="output")
+        return g.save(path, output=[1, 3, 6])
+    whole = np.array([*side, *side], dtype=float).reshape(1, 1, 4)
+    if layout == "ssd":
+        g("Div", g("Concat", left, top, right, bottom, axis=2), whole, name=names[0])
+        g("Reshape", numbers, g.const([1, 3], np.int64), name=names[1])
+        g("Reshape", score, g.const([1, 3], np.int64), name=names[2])
+        return g.save(path, **dict(zip(names, ([1, 3, 4], [1, 3], [1, 3]), strict=True)))
+    if layout == "ssd rows":
+        parts = g("Div", g("Concat", left, top, right, bottom, axis=2), whole)
+        rows = g("Concat", np.zeros((1, 3, 1)), numbers, score, parts, axis=2)
+        g("Reshape", rows, g.const([1, 1, 3, 7], np.int64), name="output")
+        return g.save(path, output=[1, 1, 3, 7])
+    g("Div", g("Concat", *centers, *sizes, axis=2), whole, name="pred_boxes")
+    held = g("Clip", classes, 1e-6, 1.0)  # logits of these scores
+    logits = g("Sub", g("Log", held), g("Log", g("Sub", 1.0, held)), name="logits" if layout == "rtdetr" else None)
+    if layout == "detr":
+        g("Concat", logits, np.zeros((1, 3, 1)), axis=2, name="logits")
+    return g.save(path, logits=[1, 3, 3 + (layout == "detr")], pred_boxes=[1, 3, 4])
+
+
+def detector(path, layout="yolo", **settings):
+    config = NetworkConfig(path, layout.split()[0], **settings)
+    return make_detector(dataclasses.replace(DEFAULT_TARGETS["bird"], detector="onnx", network=config), 25.0)
+
+
+def image(width, height, **squares):
+    """Grey, with rectangles (left, top, width, height) [px]."""
+    picture = np.full((height, width, 3), 60, np.uint8)
+    for colour, (x, y, w, h) in squares.items():
+        picture[y : y + h, x : x + w, ("blue", "green", "red").index(colour)] = 255
+    return picture
+
+
+def boxes(found):
+    """(left, top, width, height) of detections [px]."""
+    return [[*(each.center_px - (each.size_px - 1) / 2), *each.size_px] for each in found]
+
+
+def edges_of(box):
+    x, y, width, height = box
+    return [x, y, x + width, y + height]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(("width", "height"), [(96, 64), (48, 24), (192, 128), (200, 100), (100, 200)])
+def test_boxes_of_every_layout_are_where_the_targets_are(tmp_path, layout, width, height):
+    """To a pixel of the input, whatever the image's size and proportions; exactly where it is scaled by 1 or 1/2."""
+    parts = {"red": (0.1, 0.1, 0.4, 0.2), "green": (0.5, 0.5, 0.3, 0.3), "blue": (0.0, 0.7, 0.2, 0.25)}
+    targets = {
+        name: 4 * np.rint(np.multiply(part, (width, height) * 2) / 4).astype(int) for name, part in parts.items()
+    }
+    found = detector(network(tmp_path / "n.onnx", layout), layout).detect(Frame(image(width, height, **targets), 0.0))
+    assert [each.score for each in found] == pytest.approx(SCORES, abs=1e-3)
+    pixel = max(width / SIDE[0], height / SIDE[1])
+    for found_at, target in zip(map(edges_of, boxes(found)), map(edges_of, targets.values()), strict=True):
+        np.testing.assert_allclose(found_at, target, atol=0.001 if pixel in (1, 2) else max(1, pixel))
+    assert [each.clipped for each in found] == [False, False, True]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_only_the_wanted_classes_are_found(tmp_path, layout):
+    picture = image(96, 64, red=(8, 4, 20, 8), green=(30, 30, 16, 6), blue=(60, 10, 8, 8))
+    path = network(tmp_path / "n.onnx", layout)
+    assert boxes(detector(path, layout, classes=(2,)).detect(Frame(picture, 0.0))) == [pytest.approx([60, 10, 8, 8])]
+    found = detector(path, layout, classes=(2, 0), least_score=0.75).detect(Frame(picture, 0.0))
+    assert boxes(found) == [pytest.approx([8, 4, 20, 8])]
+
+
+def test_images_are_searched_in_tiles_without_doubles_at_their_seams(tmp_path):
+    """A target of 12 px fades in the whole image, which is a third as large; one of 300 px is in no tile."""
+    find = detector(network(tmp_path / "n.onnx", "yolo", (192, 128)), tiled=True)
+    for y in range(0, 390, 43):
+        for x in range(0, 588, 19):
+            found = find.detect(Frame(image(600, 400, red=(x, y, 12, 10)), 0.0))
+            assert boxes(found) == [pytest.approx([x, y, 12, 10])]
+    found = find.detect(Frame(image(600, 400, red=(120, 100, 300, 180)), 0.0))
+    assert len(found) == 1
+    np.testing.assert_allclose(boxes(found), [[120, 100, 300, 180]], atol=3.2)
+    assert find.detect(Frame(image(600, 400), 0.0)) == []
+
+
+def test_levels_are_scaled_as_the_table_says(tmp_path):
+    path = network(tmp_path / "n.onnx", "yolo")
+    dim = (image(96, 64, red=(8, 4, 20, 8)) // 3).astype(np.uint8)
+    assert detector(path).detect(Frame(dim, 0.0)) == []
+    assert len(detector(path, std=(100.0, 255.0, 255.0)).detect(Frame(dim, 0.0))) == 1
+    assert len(detector(path, mean=(20.0, 0.0, 0.0), std=(100.0, 255.0, 255.0)).detect(Frame(dim, 0.0))) == 1
+    assert detector(path, mean=(0.0, 0.0, 20.0), std=(255.0, 255.0, 100.0)).detect(Frame(dim, 0.0)) == []
+
+
+def test_a_file_that_leaves_its_size_open_takes_that_of_the_table(tmp_path):
+    path = network(tmp_path / "n.onnx", "yolo")
+    model = onnx.load(path)
+    for dim, name in zip(model.graph.input[0].type.tensor_type.shape.dim[2:], ("height", "width"), strict=True):
+        dim.dim_param = name
+    onnx.save(model, path)
+    with pytest.raises(ConfigError, match=r"takes images of any size; write network.input_px = \[640, 640\]"):
+        detector(path)
+    assert len(detector(path, input_px=SIDE).detect(Frame(image(96, 64, red=(8, 4, 20, 8)), 0.0))) == 1
+
+
+def test_a_file_that_opencv_cannot_run_is_run_by_onnxruntime(tmp_path, monkeypatch):
+    pytest.importorskip("onnxruntime")
+    path = network(tmp_path / "n.onnx", "yolo")
+    model = onnx.load(path)
+    del model.graph.output[:]
+    model.graph.node[-1].output[0] = "before"
+    noise = onnx.helper.make_node("RandomUniformLike", ["before"], ["noise"], low=0.0, high=1e-6)
+    model.graph.node.extend([noise, onnx.helper.make_node("Add", ["before", "noise"], ["output"])])
+    model.graph.output.append(onnx.helper.make_tensor_value_info("output", onnx.TensorProto.FLOAT, [1, 7, 6]))
+    onnx.save(model, path)
+    with pytest.raises(cv2.error):
+        cv2.dnn.readNetFromONNX(str(path))
+    found = detector(path).detect(Frame(image(96, 64, green=(30, 10, 16, 6)), 0.0))
+    assert boxes(found) == [pytest.approx([30, 10, 16, 6])]
+
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name == "onnxruntime":
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(
+        ConfigError, match=r"OpenCV cannot run it \(.+\); onnxruntime may: pip install 'cotarget\[onnx\]'$"
+    ):
+        detector(path)
+
+
+def test_what_is_wrong_with_a_network_is_said_in_one_line(tmp_path):
+    path = network(tmp_path / "n.onnx", "yolo")
+    text = tmp_path / "text.onnx"
+    text.write_text("no network", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"needs a table \"network\" with model"):
+        make_detector(dataclasses.replace(DEFAULT_TARGETS["bird"], detector="onnx"), 25.0)
+    for config, message in (
+        ({"path": tmp_path / "gone.onnx"}, "no such file"),
+        ({"path": tmp_path}, "no such file"),
+        ({"path": text}, "is no ONNX file of a network that takes an image"),
+        ({"path": path, "input_px": (64, 64)}, "takes images of 96x64 px; correct network.input_px"),
+        ({"path": path, "classes": (0, 80)}, "has classes 0 to 2, and not 80; correct network.classes"),
+        *(
+            ({"path": path, "layout": other}, f'gives output \\(1, 7, 6\\), which is not layout "{other}"')
+            for other in ("yolov5", "yolov10", "ssd", "detr", "rtdetr")
+        ),
+        ({"path": network(tmp_path / "5.onnx", "yolov5")}, 'gives output \\(1, 6, 8\\), which is not layout "yolo"'),
+        ({"path": network(tmp_path / "ten.onnx", "yolov10")}, 'gives output \\(1, 3, 6\\), which is not layout "yolo"'),
+    ):
+        with pytest.raises(ConfigError, match=message) as caught:
+            detector(**config)
+        assert "\n" not in str(caught.value)
+
+
+def test_rig_toml_names_the_network_beside_it(tmp_path):
+    table = {"size": 1.0, "dimension": "width", "wanted_px": 100.0, "detector": "onnx"}
+    network_table = {"model": "n.onnx", "classes": [14], "least_score": 0.3, "input_px": [640, 384], "tiled": True}
+    config = parse_config({"targets": {"gull": {**table, "network": network_table}}}, tmp_path)
+    network = config.target("gull").network
+    assert network == NetworkConfig(tmp_path / "n.onnx", "yolo", (640, 384), (14,), 0.3, True)
+    for wrong, message in (
+        ({"layout": "yolo"}, "targets.gull.network: missing key 'model'"),
+        ({"model": "n.onnx", "layout": "?"}, "targets.gull.network.layout: '?' is not one of: detr, rtdetr, ssd, yolo"),
+        ({"model": "n.onnx", "classes": [-1]}, "targets.gull.network.classes"),
+        ({"model": "n.onnx", "std": [1, 0, 1]}, "targets.gull.network.std"),
+        ({"model": "n.onnx", "size": 3}, "unknown key 'targets.gull.network.size'"),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            parse_config({"targets": {"gull": {**table, "network": wrong}}})
+        assert message in str(caught.value)
