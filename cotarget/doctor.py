@@ -148,18 +148,22 @@ def _emergency_stop(config: "RigConfig", rig: Path) -> Finding:
 
 
 def _own_detectors(config: "RigConfig", rig: Path) -> list[Finding]:
-    """Import the user's detectors that targets name."""
+    """Import the user's detectors that targets name, and load their networks."""
+    from cotarget.detection import make_detector
     from cotarget.plugins import is_own, load
 
     found = []
     for name, target in config.targets.items():
-        if is_own(target.detector):
-            where = f"targets.{name}.detector"
-            try:
+        where = f"targets.{name}.detector"
+        try:
+            if is_own(target.detector):
                 load(target.detector, where)
                 found.append(Finding(where, True, target.detector))
-            except CotargetError as error:
-                found.append(Finding(where, False, str(error), f"correct it, or [targets.{name}] in {rig}"))
+            elif target.detector == "onnx":
+                make_detector(target, rate_hz=25.0)
+                found.append(Finding(where, True, "onnx"))
+        except CotargetError as error:
+            found.append(Finding(where, False, str(error), f"correct it, or [targets.{name}] in {rig}"))
     return found
 
 

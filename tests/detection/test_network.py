@@ -9,6 +9,7 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS, NetworkConfig, parse_config
 from cotarget.detection import make_detector
+from cotarget.doctor import examine
 from cotarget.errors import ConfigError
 from cotarget.rig import Frame
 
@@ -237,6 +238,15 @@ def test_what_is_wrong_with_a_network_is_said_in_one_line(tmp_path):
         with pytest.raises(ConfigError, match=message) as caught:
             detector(**config)
         assert "\n" not in str(caught.value)
+
+
+def test_the_doctor_loads_the_networks_of_targets(tmp_path):
+    rig = {"targets": {"gull": {"size": 1.0, "dimension": "width", "wanted_px": 100.0, "detector": "onnx"}}}
+    found = {each.name: each for each in examine(parse_config({**rig, "backend": "hardware"}))}
+    assert found["targets.gull.detector"].text.startswith('a target with detector = "onnx" needs a table "network"')
+    rig["targets"]["gull"]["network"] = {"model": str(network(tmp_path / "n.onnx", "yolo"))}
+    found = {each.name: each for each in examine(parse_config({**rig, "backend": "hardware"}))}
+    assert found["targets.gull.detector"].ok
 
 
 def test_rig_toml_names_the_network_beside_it(tmp_path):
