@@ -647,7 +647,10 @@ def parse_config(table: Mapping[str, Any], folder: Path | None = None) -> RigCon
         raise ConfigError(f"targets: {given!r} is not a table")
     for name, values in given.items():
         base = _of_kind(targets, name)
-        targets[name] = validate(TargetProfile, values, f"targets.{name}", base=base, folder=folder)
+        target = validate(TargetProfile, values, f"targets.{name}", base=base, folder=folder)
+        if (target.detector == "onnx") != (target.network is not None):
+            raise ConfigError(f'targets.{name}: detector = "onnx" and a table [targets.{name}.network] need each other')
+        targets[name] = target
     sim_table = table.get("sim")
     if isinstance(sim_table, Mapping) and isinstance(sim_table.get("effects"), Mapping):
         table["sim"] = {**sim_table, "effects": _expand_all(sim_table["effects"])}

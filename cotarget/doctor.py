@@ -149,7 +149,7 @@ def _emergency_stop(config: "RigConfig", rig: Path) -> Finding:
 
 def _own_detectors(config: "RigConfig", rig: Path) -> list[Finding]:
     """Import the user's detectors that targets name, and load their networks."""
-    from cotarget.detection import make_detector
+    from cotarget.detection import make_network
     from cotarget.plugins import is_own, load
 
     found = []
@@ -160,8 +160,7 @@ def _own_detectors(config: "RigConfig", rig: Path) -> list[Finding]:
                 load(target.detector, where)
                 found.append(Finding(where, True, target.detector))
             elif target.detector == "onnx":
-                make_detector(target, rate_hz=25.0)
-                found.append(Finding(where, True, "onnx"))
+                found.append(Finding(where, True, f"onnx: {make_network(target)}"))
         except CotargetError as error:
             found.append(Finding(where, False, str(error), f"correct it, or [targets.{name}] in {rig}"))
     return found

@@ -34,6 +34,7 @@ __all__ = [
     "ExternalDetector",
     "SmallTargetDetector",
     "make_detector",
+    "make_network",
     "plain",
 ]
 
@@ -55,9 +56,7 @@ def make_detector(target: TargetProfile, rate_hz: float, template: Image | None 
         where = f"detector '{kind}'"
         return ExternalDetector(reporting(load(kind, where), where))
     if kind == "onnx":
-        if target.network is None:
-            raise ConfigError('a target with detector = "onnx" needs a table "network" with model = "network.onnx"')
-        return ExternalDetector(Network(target.network))
+        return ExternalDetector(make_network(target))
     if kind == "auto":
         return AutoDetector(rate_hz)
     if kind == "speck":
@@ -76,3 +75,14 @@ def make_detector(target: TargetProfile, rate_hz: float, template: Image | None 
             raise ConfigError(f"{target.template}: is not a picture; a target's template is a PNG or JPEG of it")
         template = np.asarray(read, dtype=np.uint8)
     return ColorTemplateDetector(template)
+
+
+def make_network(target: TargetProfile) -> Network:
+    """Load the network of a target profile.
+
+    Raises:
+        ConfigError: there is none, or it cannot be run.
+    """
+    if target.network is None:
+        raise ConfigError('a target with detector = "onnx" needs a table "network" with model = "network.onnx"')
+    return Network(target.network)

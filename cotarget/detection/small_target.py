@@ -716,10 +716,11 @@ class SmallTargetDetector:
     ) -> list[tuple[SmallTarget, Detection]]:
         """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
 
-        That of an image enlarged so many ``times`` is halved, because in it a twig sways over more pixels.
+        The difference of an image that is enlarged so many ``times`` is halved, because a twig sways over more of its
+        pixels.
         """
         earlier = [kept for kept in references if kept is not None]
-        if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > SHAKING_PX for _, then in earlier):
+        if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > times * SHAKING_PX for _, then in earlier):
             self._usual = None
             return []
         registered = (
