@@ -102,7 +102,7 @@ class TargetScore:
         boxes: labelled boxes that are scored.
         recall: part of these with a track on it.
         numbers: number of different tracks on it.
-        first_track_s: time from its first labelled frame to the first track on it [s].
+        first_track_s: time from its first labelled frame, scored or not, to the first track on it [s].
     """
 
     boxes: int
@@ -252,7 +252,7 @@ def score_tracks(
         id_found=id_found,
         id_switches=switches,
         sizes=_sizes(scored),
-        targets=_targets(scored, rate_hz),
+        targets=_targets(matches, learning_frames, rate_hz),
         **_ratios(boxes, len(pairs), false_boxes, switches, id_found),
     )
 
@@ -354,7 +354,8 @@ def _size_name(label: Label) -> str:
     return SIZE_NAMES[int(np.searchsorted(SIZES_PX, label.larger_side_px))]
 
 
-def _targets(matches: Sequence[FrameMatch], rate_hz: float) -> dict[int, TargetScore]:
+def _targets(matches: Sequence[FrameMatch], learning_frames: int, rate_hz: float) -> dict[int, TargetScore]:
+    """Score each target that is labelled in a scored frame; its first track is looked for in all frames."""
     frames: dict[int, list[tuple[int, int | None]]] = {}  # frame and track of each target
     for match in matches:
         for label, track in match.pairs:
@@ -363,9 +364,11 @@ def _targets(matches: Sequence[FrameMatch], rate_hz: float) -> dict[int, TargetS
             frames.setdefault(label.target, []).append((match.frame, None))
     scores = {}
     for target, seen in sorted(frames.items()):
-        found = [(frame, track) for frame, track in seen if track is not None]
-        first = (found[0][0] - seen[0][0]) / rate_hz if found else None
-        scores[target] = TargetScore(len(seen), len(found) / len(seen), len({track for _, track in found}), first)
+        first = next(((frame - seen[0][0]) / rate_hz for frame, track in seen if track is not None), None)
+        scored = [track for frame, track in seen if frame >= learning_frames]
+        found = [track for track in scored if track is not None]
+        if scored:
+            scores[target] = TargetScore(len(scored), len(found) / len(scored), len(set(found)), first)
     return scores
 
 

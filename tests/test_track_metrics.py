@@ -177,6 +177,8 @@ def test_such_a_track_finds_no_identity_either():
 def test_the_first_track_is_timed_from_the_first_label():
     labels, tracks = boxes_of(Label, [(i, 1, 100) for i in range(9)]), boxes_of(Tracked, [(i, 1, 100) for i in (5, 6)])
     assert score_tracks(tracks, labels, RATE, 9, 0).targets[1].first_track_s == pytest.approx(5 / RATE)
+    later = score_tracks(tracks, labels, RATE, 9, 7).targets[1]  # frames that are not scored count for it
+    assert (later.boxes, later.first_track_s) == (2, pytest.approx(5 / RATE))
 
 
 def test_films_are_pooled_by_boxes():

@@ -137,7 +137,8 @@ class Network:
                 raise ValueError
         except (ValueError, IndexError, StopIteration):
             shapes = ", ".join(f"{name} {array.shape}" for name, array in outputs.items())
-            raise ConfigError(f'{config.model}: gives {shapes}, which is not layout "{config.layout}"') from None
+            wanted = f'layout "{config.layout}" has {WANTED[config.layout]}'
+            raise ConfigError(f"{config.model}: gives {shapes}; {wanted}") from None
         if labels is not None:
             best = np.where(np.isin(labels, config.classes), scores, 0.0) if config.classes else scores
         elif max(config.classes, default=0) < scores.shape[1]:
@@ -224,6 +225,15 @@ def _rtdetr(outputs: Outputs, side: Array) -> Boxes:
     return Boxes(boxes * np.tile(side, 2), 1 / (1 + np.exp(-logits.clip(-50, 50))))
 
 
+# By layout, what the outputs are, for messages.
+WANTED: Mapping[str, str] = {
+    "yolo": "(1, 4 + classes, n), with scores from 0 to 1",
+    "yolov5": "(1, n, 5 + classes), with scores from 0 to 1",
+    "yolov10": "(1, n, 6), with scores from 0 to 1",
+    "ssd": "outputs named boxes, labels and scores, or rows of 7 numbers",
+    "detr": "outputs named boxes and logits",
+    "rtdetr": "outputs named boxes and logits, or (1, n, 4 + classes)",
+}
 # By layout, what makes boxes of the outputs and the input's size (width, height).
 LAYOUTS: Mapping[str, Callable[[Outputs, Array], Boxes]] = {
     "yolo": _yolo,

@@ -335,11 +335,14 @@ def test_what_is_wrong_with_a_network_is_said_in_one_line(tmp_path):
         ({"path": path, "input_px": (64, 64)}, "takes images of 96 x 64 px; correct network.input_px"),
         ({"path": path, "classes": (0, 80)}, "has classes 0 to 2, and not 80; correct network.classes"),
         *(
-            ({"path": path, "layout": other}, f'gives output \\(1, 7, 6\\), which is not layout "{other}"')
+            ({"path": path, "layout": other}, f'gives output \\(1, 7, 6\\); layout "{other}" has ')
             for other in ("yolov5", "yolov10", "ssd", "detr")
         ),
-        ({"path": network(tmp_path / "5.onnx", "yolov5")}, 'gives output \\(1, 6, 8\\), which is not layout "yolo"'),
-        ({"path": network(tmp_path / "ten.onnx", "yolov10")}, 'gives output \\(1, 3, 6\\), which is not layout "yolo"'),
+        (
+            {"path": network(tmp_path / "5.onnx", "yolov5")},
+            'gives output \\(1, 6, 8\\); layout "yolo" has \\(1, 4 \\+ classes, n\\), with scores',
+        ),
+        ({"path": network(tmp_path / "ten.onnx", "yolov10")}, 'gives output \\(1, 3, 6\\); layout "yolo" has '),
     ):
         with pytest.raises(ConfigError, match=message) as caught:
             detector(**config)
