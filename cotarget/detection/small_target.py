@@ -640,8 +640,9 @@ WIDEST_PX, MOST_TIMES = 960, 4
 # Least contrast in an image that was doubled twice and has more noise than LEAST_ROUGHNESS: its finest scale lies
 # within one pixel of the camera, so the mean does not reduce the noise.
 NOISY_SIGNAL = 5.5
-# Least span of the history before anything is detected [s].
-WARM_UP_S = AGES_S[1]
+# Least span of the history before anything is detected: at first, when it has an image of the shortest age; and after a
+# cut, whose new scene must be seen for a while [s].
+WARM_UP_S, AFTER_CUT_S = 0.05, AGES_S[1]
 
 
 class SmallTargetDetector:
@@ -652,6 +653,7 @@ class SmallTargetDetector:
         self._least_score = least_score
         self.camera = CameraMotion()
         self._history = History()
+        self._warm_up_s = WARM_UP_S
         self._usual: Image | None = None  # mean difference from earlier images, float32
         self.shift: Array = np.zeros(2)  # of the camera since the first frame [px], (2,)
         self._shape: tuple[int, ...] | None = None
@@ -684,10 +686,11 @@ class SmallTargetDetector:
         shift = times * shift
         if self.camera.jumped:
             self._history.clear()
+            self._warm_up_s = AFTER_CUT_S
         references = self._history.references(frame.t)
         self.repeated = not self._history.add(frame.t, grey, shift)
         self.mask = np.zeros(frame.image.shape[:2], np.uint8)
-        if self.repeated or self._history.span < WARM_UP_S:
+        if self.repeated or self._history.span < self._warm_up_s:
             return []
         shape = tuple(times * side for side in frame.image.shape[:2])
         found: list[tuple[SmallTarget, Detection]] = []
