@@ -49,15 +49,16 @@ class OnnxFile:
         self.side = np.array(_size(path, declared, input_px))
         grey = np.full((1, 3, *self.side[::-1]), 0.5, np.float32)
         reasons = []
-        for self.runtime, load in (("OpenCV", _by_opencv), ("onnxruntime", _by_onnxruntime)):
+        for runtime, load in (("OpenCV", _by_opencv), ("onnxruntime", _by_onnxruntime)):
             try:
-                self._run = load(path, declared.name)
-                self._run(grey)
+                run = load(path, declared.name)
+                run(grey)
             except ImportError:
                 reasons.append("onnxruntime may: pip install 'cotarget[onnx]'")
             except Exception as error:  # the errors of both share no class
-                reasons.append(f"{self.runtime} cannot run it ({_one_line(error)})")
+                reasons.append(f"{runtime} cannot run it ({_one_line(error)})")
             else:
+                self.runtime, self._run = runtime, run
                 return
         raise ConfigError(f"{path}: {'; '.join(reasons)}")
 
