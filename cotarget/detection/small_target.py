@@ -642,7 +642,7 @@ WIDEST_PX, MOST_TIMES = 960, 4
 NOISY_SIGNAL = 5.5
 # Least span of the history before anything is detected: at first, when it has an image of the shortest age; and after a
 # cut, whose new scene must be seen for a while [s].
-WARM_UP_S, AFTER_CUT_S = 0.05, AGES_S[1]
+WARM_UP_S, AFTER_CUT_S = 0.09, AGES_S[1]
 
 
 class SmallTargetDetector:
