@@ -425,14 +425,14 @@ class NetworkConfig:
 
     Attributes:
         model: ONNX file with an input of 1 x 3 x height x width, RGB; relative to rig.toml.
-        layout: how it writes boxes: "yolo" (YOLOv8 and later), "yolov5" (with a score for any target), "yolov10"
+        layout: how it writes boxes: "yolo" (YOLOv8 and later), "yolov5" (with objectness), "yolov10"
             (corners, score and class), "ssd" (boxes, labels and scores), "detr", or "rtdetr" (no logit for no target).
         input_px: size of its input [px]; that of the file by default.
         classes: numbers of the classes that are the target; all by default.
         least_score: least score of a detection.
         tiled: whether images larger than the input are also searched in tiles at full resolution, for small targets.
-        mean: level of each channel that is subtracted from the image, red first.
-        std: level of each channel that the difference is divided by.
+        mean: mean of each channel, subtracted from the pixel values, red first.
+        std: standard deviation of each channel, by which the difference is divided.
     """
 
     model: Annotated[NotEmptyPath, InFolder(lambda path, folder: (folder / path).absolute())]

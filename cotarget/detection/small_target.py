@@ -719,8 +719,7 @@ class SmallTargetDetector:
     ) -> list[tuple[SmallTarget, Detection]]:
         """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
 
-        The difference of an image that is enlarged so many ``times`` is halved, because a twig sways over more of its
-        pixels.
+        The difference of an image enlarged by a factor ``times`` is halved: a twig sways over more of its pixels.
         """
         earlier = [kept for kept in references if kept is not None]
         if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > times * SHAKING_PX for _, then in earlier):
@@ -768,7 +767,7 @@ class SmallTargetDetector:
 
 
 def _enlarged(grey: Image) -> tuple[Image, int]:
-    """Double an image while its larger side stays within WIDEST_PX; return it, and how many times as large it is."""
+    """Double an image while its larger side stays within WIDEST_PX; return it and its factor."""
     times = 1
     while times < MOST_TIMES and 2 * times * max(grey.shape) <= WIDEST_PX:
         times *= 2
@@ -779,9 +778,9 @@ def _enlarged(grey: Image) -> tuple[Image, int]:
 
 
 def _boxed(target: SmallTarget, score: float, shape: tuple[int, ...], times: int) -> Detection:
-    """Make a detection of a region of an image of a shape (H, W), so many ``times`` as large as the camera's."""
+    """Make a detection of a region of an image of a shape (H, W), enlarged by a factor ``times``."""
     box = box_detection(*target.low, *target.size, score, shape)
-    # Interpolation blurs the camera's last pixel over as many as it is enlarged.
+    # Interpolation spreads the camera's last pixel over ``times`` pixels.
     if is_clipped(box.center_px, box.size_px + 2 * (times - 1), shape):
         box = replace(box, score=min(score, MOST_CLIPPED_SCORE), clipped=True)
     return replace(box, center_px=(box.center_px + 0.5) / times - 0.5, size_px=box.size_px / times)

@@ -1,6 +1,6 @@
 """The films of `films`, altered: smaller, larger, shaken, compressed, with frames left out.
 
-Labels are altered with the films. Recall is told for all boxes and for those up to 12 px, with the detector's and the
+Labels are altered with the films. Recall is given for all boxes and for those up to 12 px, with the detector's and the
 tracker's usual settings.
 """
 
