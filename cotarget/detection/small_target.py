@@ -288,9 +288,9 @@ REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES_OF_DIFFERENCE, 2**SCALES_OF_DIF
 SLOPING_SCALE = 2
 # Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
 LEAST_ROUGHNESS = 1.5
-# Factor by which the roughness of the surroundings counts for the mean of 2x2 px, in which targets of one or two pixels
-# are searched: leaves and grass have such spots, a sky has none.
-PAIR_TIMES = 2.0
+# Factor by which the roughness of the surroundings counts where targets of one or two pixels are searched, in the mean of
+# 2x2 px or in an image of twice the size: leaves and grass have such spots, a sky has none.
+SMALLEST_TIMES = 2.0
 # How far beside a target other texture counts: in parts of its larger side, and in pixels of the texture.
 BESIDE, BESIDE_PX = 2.0, 6.0
 # Part of the contrast at which a target's outline lies.
@@ -437,27 +437,28 @@ def _peaks(
         sloping: whether to fit a plane to the ring.
         threshold: least contrast, in standard deviations of the surroundings.
         most: most peaks.
-        finer: image of twice the size in which the contrast is searched, because a target of four pixels fades in the
-            mean; None to search this one.
-        finest: whether targets of one or two pixels are searched too, where the surroundings are plain.
+        finer: image of twice the size in which targets of one or two pixels are searched too; None for none.
+        finest: whether these are searched in this image instead.
     """
     mean, deviation = _ring(half, sloping)
     size = (level.shape[1], level.shape[0])
-    low, high = _limits(mean, deviation, threshold, size)
-    dark = bright = cv2.boxFilter(level if finer is None else finer, -1, (INNER_PX, INNER_PX))
-    if finer is not None:
-        pair = np.ones((2, 2), np.uint8)
-        dark, bright = (
-            cv2.resize(of(dark, pair), size, interpolation=cv2.INTER_NEAREST) for of in (cv2.erode, cv2.dilate)
-        )
-    off = cv2.max(cv2.subtract(low, dark), cv2.subtract(bright, high))
-    pair, rougher = level, deviation
-    if finest:
-        # Linear interpolation halfway between pixels is the mean of 2x2 px, at a third of boxFilter's time.
-        pair = cv2.getRectSubPix(level, size, (size[0] / 2 - 1, size[1] / 2 - 1))
-        rougher = deviation * np.float32(PAIR_TIMES) - np.float32((PAIR_TIMES - 1) * LEAST_ROUGHNESS)
-        low, high = _limits(mean, rougher, threshold, size)
-        off = cv2.max(off, cv2.max(cv2.subtract(low, pair), cv2.subtract(pair, high)))
+    blurred = cv2.boxFilter(level, -1, (INNER_PX, INNER_PX))
+    searched = [(blurred, blurred, deviation)]  # darkest and brightest around each pixel, roughness of the surroundings
+    if finer is not None or finest:
+        rougher = deviation * np.float32(SMALLEST_TIMES) - np.float32((SMALLEST_TIMES - 1) * LEAST_ROUGHNESS)
+        if finer is None:
+            # Linear interpolation halfway between pixels is the mean of 2x2 px, at a third of boxFilter's time.
+            dark = bright = cv2.getRectSubPix(level, size, (size[0] / 2 - 1, size[1] / 2 - 1))
+        else:
+            blurred, pair = cv2.boxFilter(finer, -1, (INNER_PX, INNER_PX)), np.ones((2, 2), np.uint8)
+            dark, bright = (
+                cv2.resize(of(blurred, pair), size, interpolation=cv2.INTER_NEAREST) for of in (cv2.erode, cv2.dilate)
+            )
+        searched.append((dark, bright, rougher))
+    off = np.zeros(level.shape, np.uint8)
+    for dark, bright, roughness in searched:
+        low, high = _limits(mean, roughness, threshold, size)
+        off = cv2.max(off, cv2.max(cv2.subtract(low, dark), cv2.subtract(bright, high)))
     mask = cv2.compare(off, 0, cv2.CMP_GT)
     peaks = []
     for contour in cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
@@ -467,11 +468,11 @@ def _peaks(
         _, _, _, (i, j) = cv2.minMaxLoc(off[y : y + h, x : x + w])
         u, v = x + i, y + j
         at = (min(v // 2, half.shape[0] - 1), min(u // 2, half.shape[1] - 1))
-        around, rough = float(mean[at]), float(deviation[at])
-        contrast = max(float(bright[v, u]) - around, around - float(dark[v, u]))
-        signal = contrast / rough
-        if finest:
-            signal = max(signal, abs(float(pair[v, u]) - around) / float(rougher[at]))
+        around = float(mean[at])
+        signal = max(
+            max(float(bright[v, u]) - around, around - float(dark[v, u])) / float(roughness[at])
+            for dark, bright, roughness in searched
+        )
         peaks.append(_Peak(u, v, scale, signal, around))
     peaks.sort(key=lambda peak: -peak.signal)
     return peaks[:most]

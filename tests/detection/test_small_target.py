@@ -121,6 +121,18 @@ def test_a_bird_of_one_pixel_before_a_plain_sky_is_found():
     assert np.mean([bool(each) for each in near]) >= 0.9
 
 
+@pytest.mark.parametrize(("rough", "found"), [(0.0, True), (10.0, False)])
+def test_a_spot_in_a_large_picture_is_found_before_a_sky_and_not_among_leaves(rough, found):
+    """Leaves have such spots. Leaf and spot are 4 px large; the spot's contrast is 6 times the leaves' deviation."""
+    rng = np.random.default_rng(1)
+    leaves = cv2.resize(rng.normal(120, rough, (240, 320)), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
+    leaves[478:482, 638:642] = 120 + 60
+    fine = np.clip(np.rint(leaves + rng.normal(0, NOISE, leaves.shape)), 0, 255).astype(np.uint8)
+    half = cv2.resize(fine, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    boxes = [(*each.low, *each.size) for each in find_small_targets(half, 4.5, 40, finer=[fine])]
+    assert any(x <= 639 < x + w and y <= 479 < y + h for x, y, w, h in boxes) == found
+
+
 @pytest.mark.parametrize(("length", "step"), [(12, 1), (12, 2), (24, 2), (24, 4), (40, 3)])
 def test_all_of_a_plain_bird_is_boxed_though_only_its_front_is_new(length, step):
     """It moves by less than its own length in the shortest time over which pictures are compared."""
