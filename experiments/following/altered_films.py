@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from cotarget.config import DEFAULT_TARGETS, DetectorName
+from cotarget.detection.base import moved
 from cotarget.rig import Frame, Image
 from cotarget.track_metrics import Box, Label, score_tracks
 from cotarget.tracking.track import tracking_settings
@@ -61,7 +62,9 @@ def one(settings: AlteredFilmsSettings, number: int) -> list[Row]:
     for name, alter in ALTERATIONS.items():
         altered = alter(film)
         tracks = detector_tracks(settings.detector, (least,), altered.frames, altered.rate_hz)[least]
-        specks = score_tracks(tracks, _only_specks(altered), altered.rate_hz, len(altered.frames))
+        specks = score_tracks(
+            tracks, _only_specks(altered), altered.rate_hz, len(altered.frames), criterion=altered.criterion
+        )
         row = {**altered.row(name, least, 0, tracks), "specks": specks.boxes, "specks_found": specks.found}
         rows.append({"seed": number, **row, "minutes": len(film.frames) / film.rate_hz / 60})
     return rows
@@ -79,7 +82,7 @@ def _only_specks(film: LabelledFilm) -> dict[int, list[Label]]:
 
 
 def scaled(film: LabelledFilm, times: float) -> LabelledFilm:
-    """Scale a film."""
+    """Scale a film; the labels of a larger one are as loose as before, so its small boxes are larger too."""
     height, width = film.frames[0].image.shape[:2]
     size = round(times * width), round(times * height)
     way = cv2.INTER_AREA if times < 1 else cv2.INTER_CUBIC
@@ -92,17 +95,14 @@ def scaled(film: LabelledFilm, times: float) -> LabelledFilm:
         frames=[_with(frame, cv2.resize(frame.image, size, interpolation=way)) for frame in film.frames],
         labels={frame: [move(label) for label in labels] for frame, labels in film.labels.items()},
         flyers={frame: [move(flyer) for flyer in flyers] for frame, flyers in film.flyers.items()},
+        criterion=replace(film.criterion, small_px=film.criterion.small_px * max(1.0, times)),
     )
 
 
 def shaken(film: LabelledFilm) -> LabelledFilm:
     """Shift every frame at random, by a standard deviation of SHAKE_PX along each axis."""
     shifts = np.random.default_rng(1).normal(0, SHAKE_PX, (len(film.frames), 2))
-    frames = []
-    for frame, shift in zip(film.frames, shifts, strict=True):
-        M = np.column_stack([np.eye(2), shift])
-        size = frame.image.shape[1::-1]
-        frames.append(_with(frame, cv2.warpAffine(frame.image, M, size, borderMode=cv2.BORDER_REPLICATE)))
+    frames = [_with(frame, moved(frame.image, shift)) for frame, shift in zip(film.frames, shifts, strict=True)]
 
     def move(boxes: Mapping[int, Sequence[B]]) -> dict[int, list[B]]:
         return {

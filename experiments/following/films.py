@@ -22,7 +22,7 @@ from cotarget.detection.background import pieces
 from cotarget.detection.base import box_detection
 from cotarget.files import read_table
 from cotarget.rig import Frame, Image
-from cotarget.track_metrics import Box, Label, Tracked, off_boxes, read_labels, score_tracks
+from cotarget.track_metrics import Box, Criterion, Label, Tracked, off_boxes, read_labels, score_tracks
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Registering, Tracker, update_tracks
 from cotarget.video import Film
@@ -84,18 +84,30 @@ def one(settings: FilmsSettings, number: int) -> list[Row]:
 
 @dataclass(frozen=True)
 class LabelledFilm:
-    """A film: its name, frames, frame rate [Hz], labels by frame number, and boxes of flyers without a label."""
+    """A film with its labels.
+
+    Attributes:
+        name: name of its file.
+        frames: all frames.
+        rate_hz: frame rate [Hz].
+        labels: labels by frame number.
+        flyers: boxes of flyers without a label, by frame number.
+        criterion: when a track is on a label.
+    """
 
     name: str
     frames: list[Frame]
     rate_hz: float
     labels: dict[int, list[Label]]
     flyers: dict[int, list[Box]]
+    criterion: Criterion = Criterion()
 
     def row(self, way: str, threshold: float, area: int, tracks: Iterable[Tracked]) -> Row:
         """Score the tracks of a way with a threshold and a smallest area [px]."""
-        score = score_tracks(tracks, self.labels, self.rate_hz, len(self.frames))
-        others = score_tracks(off_boxes(tracks, self.flyers), self.labels, self.rate_hz, len(self.frames))
+        score, others = (
+            score_tracks(found, self.labels, self.rate_hz, len(self.frames), criterion=self.criterion)
+            for found in (tracks, off_boxes(tracks, self.flyers, self.criterion))
+        )
         return {
             "film": self.name,
             "way": way,

@@ -45,6 +45,11 @@ def test_scaled_films_have_boxes_of_that_size():
     assert half.labels[0][0].size_px.tolist() == [4, 4]
 
 
+@pytest.mark.parametrize(("times", "small_px"), [(0.5, 24.0), (2.0, 48.0)])
+def test_small_boxes_of_a_larger_film_are_larger(times, small_px):
+    assert scaled(film(2), times).criterion.small_px == small_px
+
+
 def test_dropped_frames_leave_the_others_at_their_times():
     times = [frame.t for frame in dropped(film(1000)).frames]
     assert len(times) == pytest.approx(700, abs=50)
