@@ -288,8 +288,8 @@ REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES_OF_DIFFERENCE, 2**SCALES_OF_DIF
 SLOPING_SCALE = 2
 # Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
 LEAST_ROUGHNESS = 1.5
-# Factor by which the roughness of the surroundings counts where targets of one or two pixels are searched, in the mean of
-# 2x2 px or in an image of twice the size: leaves and grass have such spots, a sky has none.
+# Factor by which the roughness of the surroundings counts where targets of one or two pixels are searched, in the mean
+# of 2x2 px or in an image of twice the size: leaves and grass have such spots, a sky has none.
 SMALLEST_TIMES = 2.0
 # How far beside a target other texture counts: in parts of its larger side, and in pixels of the texture.
 BESIDE, BESIDE_PX = 2.0, 6.0

@@ -8,7 +8,7 @@ the labelled ones of the Drone-detection-dataset, looked for in ../shared/data b
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,7 +100,7 @@ class LabelledFilm:
     rate_hz: float
     labels: dict[int, list[Label]]
     flyers: dict[int, list[Box]]
-    criterion: Criterion = Criterion()
+    criterion: Criterion = field(default_factory=Criterion)
 
     def row(self, way: str, threshold: float, area: int, tracks: Iterable[Tracked]) -> Row:
         """Score the tracks of a way with a threshold and a smallest area [px]."""
