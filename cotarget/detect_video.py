@@ -14,7 +14,7 @@ import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.detection import make_detector
-from cotarget.drawing import draw_box, write_picture, write_text
+from cotarget.drawing import FULL_HEIGHT_PX, draw_box, enlarged, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
@@ -23,6 +23,7 @@ from cotarget.rig import Image
 from cotarget.track_metrics import (
     LEARNING_FRAMES,
     Criterion,
+    Label,
     Mistake,
     match_frames,
     mistakes,
@@ -142,24 +143,48 @@ def _row(index: int, t: float, track: Track) -> list[str]:
 
 
 class Trails:
-    """Draw tracks as boxes with their id and their trail."""
+    """Draw tracks as boxes with their id and their trail, in an image of a small film enlarged."""
 
     def __init__(self) -> None:
         self._trails: dict[int, list[tuple[float, Array]]] = {}
 
     def draw(self, image: Image, tracks: Sequence[Track], t: float) -> Image:
         """Draw tracks on a copy of an image; a box is thin while its target is only predicted."""
-        image = image.copy()
+        times = max(1, FULL_HEIGHT_PX // image.shape[0])
+        image = enlarged(image, times)
         self._trails = {
             track.id: [at for at in self._trails.get(track.id, []) if at[0] >= t - TRAIL_S] + [(t, track.center_px)]
             for track in tracks
         }
         for track in tracks:
             colour, trail = COLOURS[track.id % len(COLOURS)], self._trails[track.id]
-            way = np.rint([center for _, center in trail]).astype(np.int32)
+            way = np.rint([times * (center + 0.5) - 0.5 for _, center in trail]).astype(np.int32)
             cv2.polylines(image, [way.reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA)
-            draw_box(image, track.center_px, track.size_px, colour, str(track.id), bold=track.missed == 0)
+            center, size = times * (track.center_px + 0.5) - 0.5, times * track.size_px
+            draw_box(image, center, size, colour, str(track.id), bold=track.missed == 0)
         return image
+
+
+# Labels
+
+
+def labels_of_film(video: Path, file: Path) -> dict[int, list[Label]]:
+    """Read a film's labels by frame number, see `read_labels`.
+
+    Raises:
+        CotargetError: film or labels cannot be read, or most boxes are outside the picture.
+    """
+    labels = read_labels(file)
+    with Film(video) as film:
+        width, height = film.size
+    centers = np.array([label.center_px for boxes in labels.values() for label in boxes])
+    outside = int(((centers < 0) | (centers >= (width, height))).any(axis=1).sum())
+    if outside > len(centers) / 2:
+        raise ConfigError(
+            f"{file}: {outside} of {len(centers)} boxes are outside {video}'s picture of {width}x{height} px; "
+            "give the labels of this film, in its pixels"
+        )
+    return labels
 
 
 # Folders of films
@@ -219,10 +244,7 @@ def run_on_folder(
         CotargetError: a film or its labels cannot be read, or a file cannot be written.
     """
     results, scores, tiles, minutes = {}, [], [], 0.0
-    labels = [read_labels(file) for _, file in films]
-    for film, _ in films:  # an error before the long work, not after it
-        with Film(film):
-            pass
+    labels = [labels_of_film(*pair) for pair in films]  # an error before the long work, not after it
     for i, ((film, _), boxes) in enumerate(zip(films, labels, strict=True)):
         progress(i, len(films), film.stem)
         table = tables / f"{film.stem}.csv"

@@ -22,7 +22,7 @@ from cotarget.track_metrics import (
     read_tracks,
     score_tracks,
 )
-from cotarget.video import FilmWriter
+from cotarget.video import Film, FilmWriter
 from tests.support.recorded_run import RATE_HZ, Bright, calibration_file, record
 
 RATE = 25.0
@@ -272,6 +272,23 @@ def test_the_command_scores_a_film(tmp_path, capsys):
     assert len(read_tracks(tmp_path / "tracks.csv")) >= 50
 
 
+def test_tracks_in_a_small_film_are_drawn_in_an_enlarged_one(tmp_path):
+    """320x120 px, four times; the box is four times as far, and the target stays visible in it."""
+    write_film(tmp_path / "film.mp4")
+    given = ["--csv", str(tmp_path / "tracks.csv"), "--video", str(tmp_path / "drawn.mp4")]
+    assert main(["detect", str(tmp_path / "film.mp4"), "--target", "bird", *given]) == 0
+    with Film(tmp_path / "drawn.mp4") as film:
+        image = list(film)[60].image
+    assert image.shape == (480, 1280, 3)
+    target = slice(4 * 50, 4 * 60), slice(4 * 200, 4 * 210)
+    assert np.median(image[target]) < 60
+    colour = np.ptp(image.astype(int), axis=2)
+    v, u = np.argwhere(colour > 80).T
+    assert u.max() - u.min() > 40  # box and trail
+    near = np.abs(u - 820) < 40
+    assert abs(np.median(v[near]) - 220) < 40
+
+
 @pytest.fixture
 def folder(tmp_path):
     """Two films; the second one's labels are where nothing is."""
@@ -332,6 +349,19 @@ def test_a_film_that_cannot_be_read_is_refused_before_the_others_are_searched(fo
     (folder / "films" / "two.mp4").write_text("no film")
     assert detect_folder(folder) == 1
     assert "two.mp4" in capsys.readouterr().err
+    assert not list((folder / "tables").iterdir())
+
+
+def test_labels_of_a_larger_film_are_refused_before_the_search(folder, capsys):
+    """Two of three boxes are outside the picture of 320x120 px."""
+    labels = folder / "films" / "two.csv"
+    labels.write_text("frame,x_px,y_px,width_px,height_px\n40,600,50,9,9\n41,50,200,9,9\n42,300,100,9,9\n")
+    film = folder / "films" / "two.mp4"
+    given = ["--target", "bird", "--csv", str(folder / "two.csv"), "--labels", str(labels)]
+    for search in (lambda: detect_folder(folder), lambda: main(["detect", str(film), *given])):
+        assert search() == 1
+        err = capsys.readouterr().err
+        assert err.startswith(f"cotarget detect: {labels}: 2 of 3 boxes are outside {film}'s picture of 320x120 px; ")
     assert not list((folder / "tables").iterdir())
 
 

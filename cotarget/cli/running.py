@@ -178,8 +178,8 @@ def detect_command(options: argparse.Namespace) -> None:
     """Run `cotarget detect`: run the fixed camera's detector and tracker on a video, or on a folder of videos."""
     from cotarget.backends import load_config
     from cotarget.config import RigConfig
-    from cotarget.detect_video import run_on_film
-    from cotarget.track_metrics import Criterion, read_labels, read_tracks
+    from cotarget.detect_video import labels_of_film, run_on_film
+    from cotarget.track_metrics import Criterion, read_tracks
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
     with naming("--target"):
@@ -196,7 +196,7 @@ def detect_command(options: argparse.Namespace) -> None:
         raise ConfigError("--labels: scores the table of --csv; name its file, not -")
     table = None if options.csv == STDOUT else options.csv
     check_outputs([table, options.video], [options.film, options.labels, *rig_files(options.rig, config)])
-    labels = None if options.labels is None else read_labels(options.labels)
+    labels = None if options.labels is None else labels_of_film(options.film, options.labels)
     with progress_bar() as progress:
         found = run_on_film(options.film, target, options.csv, options.video, progress, keep=True)
     whole = found.shortfall is None
