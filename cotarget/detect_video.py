@@ -14,7 +14,7 @@ import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.detection import make_detector
-from cotarget.drawing import FULL_HEIGHT_PX, draw_box, enlarged, write_picture, write_text
+from cotarget.drawing import BOX_MARGIN_PX, FULL_HEIGHT_PX, draw_box, enlarged, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
@@ -157,10 +157,11 @@ class Trails:
             for track in tracks
         }
         for track in tracks:
-            colour, trail = COLOURS[track.id % len(COLOURS)], self._trails[track.id]
-            way = np.rint([times * (center + 0.5) - 0.5 for _, center in trail]).astype(np.int32)
-            cv2.polylines(image, [way.reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA)
+            colour = COLOURS[track.id % len(COLOURS)]
             center, size = times * (track.center_px + 0.5) - 0.5, times * track.size_px
+            way = np.array([times * (at + 0.5) - 0.5 for _, at in self._trails[track.id]])
+            way = way[(np.abs(way - center) > size / 2 + BOX_MARGIN_PX).any(axis=1)]  # a small target stays visible
+            cv2.polylines(image, [np.rint(way).astype(np.int32).reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA)
             draw_box(image, center, size, colour, str(track.id), bold=track.missed == 0)
         return image
 
