@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.detection.base import Detection, box_detection, check_size, is_clipped, moved
 from cotarget.geometry import Array
@@ -28,24 +29,28 @@ from cotarget.rig import Frame, Image
 
 # Factor by which the image is reduced before corners are tracked; full size gives no better shift at twice the cost.
 SCALE = 2
-# Most corners, their least distance [px of the reduced image], and the weakest relative to the strongest.
-CORNERS, APART_PX, WEAKEST = 60, 6, 0.02
+# Cells along width and height; of each, the strongest corner is tracked, so that a large target does not have most.
+CORNER_CELLS = (16, 12)
 # Least eigenvalue of a corner, of cv2.cornerMinEigenVal: noise of 5 grey levels reaches it. In an image of sky
 # alone, the strongest corners are the target and artefacts of the codec.
 LEAST_CORNER = 3e-4
 CORNER_BLOCK = 3
 # With fewer corners the median is no measurement, and the camera is taken to stand still.
 FEWEST = 8
-# So many that come at once are those of another scene.
+# The same if the standard deviation of their places is less than this part of the image's side, along both axes: they
+# are on a target before a plain background. Places all over half an image have 0.144.
+SPREAD = 0.144
+# Fewest corners, where there were too few before, that show another scene.
 MANY = 24
-# If less than this part of the corners is found again, the film was cut or the camera was moved.
-FOUND_AGAIN = 0.3
+# If less than the first part of the corners is found again, or less than the second part of these at one shift, the
+# film was cut or the camera was moved.
+FOUND_AGAIN, FEWEST_ALIKE = 0.3, 0.35
 # Frames after which corners are detected again, because some have drifted off and some are on a target.
 RENEW_FRAMES = 15
 # Window in which a corner is tracked, and pyramid levels: up to 20 px a frame of the full image.
 WINDOW_PX, LEVELS = (11, 11), 2
-# A larger median absolute deviation of the corners' shifts shows another scene [px].
-DISAGREEMENT_PX = 2.0
+# Corners have one shift if theirs differ from it by at most this [px].
+AGREEMENT_PX = 2.0
 
 
 class CameraMotion:
@@ -61,7 +66,7 @@ class CameraMotion:
     def __init__(self) -> None:
         """Start with no shift."""
         self._last: Image | None = None
-        self._corners: Image | None = None
+        self._corners: npt.NDArray[np.float32] | None = None
         self._age = 0
         self._shift = np.zeros(2)
         self.jumped = False
@@ -86,35 +91,54 @@ class CameraMotion:
         """Shift between two frames [px of the reduced image]."""
         self.jumped = False
         self._age += 1
-        if self._corners is None or self._age >= RENEW_FRAMES or len(self._corners) < FEWEST:
+        if self._corners is None or self._age >= RENEW_FRAMES:
             self._corners = _corners(before)
             self._age = 0
-        if self._corners is None or len(self._corners) < FEWEST:
+        if len(self._corners) < FEWEST or _spread(self._corners, before) < SPREAD:
             # A film that goes on in another place: where there was sky alone, there are many corners at once.
             come = _corners(after)
-            self.jumped = come is not None and len(come) >= MANY
+            self.jumped = len(self._corners) < FEWEST and len(come) >= MANY and _spread(come, after) >= SPREAD
+            self._corners = come
             return np.zeros(2)
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        ahead, found, _ = cv2.calcOpticalFlowPyrLK(
             before, after, self._corners, None, winSize=WINDOW_PX, maxLevel=LEVELS
         )
         kept = found.ravel() > 0
-        flow = (moved - self._corners).reshape(-1, 2)[kept]
-        shift = np.median(flow, axis=0) if len(flow) else np.zeros(2)
-        if kept.mean() < FOUND_AGAIN or np.median(np.abs(flow - shift)) > DISAGREEMENT_PX / SCALE:
+        flow = (ahead - self._corners).reshape(-1, 2)
+        alike = kept & _alike(flow, np.median(flow[kept], axis=0) if kept.any() else np.zeros(2))
+        standing = kept & _alike(flow, np.zeros(2))
+        # A large target may have more corners than the scene, but the scene extends over more of the image.
+        if _spread(self._corners[standing], before) > _spread(self._corners[alike], before):
+            alike = standing
+        if kept.mean() < FOUND_AGAIN or alike.sum() < FEWEST_ALIKE * kept.sum():
             self.jumped = True
             self._corners = None
             return np.zeros(2)
-        self._corners = moved[kept]
-        return np.asarray(shift, dtype=float)
+        self._corners = ahead[kept]
+        return np.asarray(np.median(flow[alike], axis=0), dtype=float)
 
 
-def _corners(picture: Image) -> Image | None:
-    """Detect corners stronger than noise, (n, 1, 2); None if there are none."""
-    corners = cv2.goodFeaturesToTrack(picture, CORNERS, WEAKEST, APART_PX, blockSize=CORNER_BLOCK)
-    if corners is None:
-        return None
-    u, v = corners.reshape(-1, 2).astype(int).T
-    return np.asarray(corners[cv2.cornerMinEigenVal(picture, CORNER_BLOCK)[v, u] >= LEAST_CORNER])
+def _corners(picture: Image) -> npt.NDArray[np.float32]:
+    """Detect the strongest corner of each cell that is stronger than noise, (n, 1, 2)."""
+    strength = cv2.cornerMinEigenVal(picture, CORNER_BLOCK)
+    columns, rows = CORNER_CELLS
+    height, width = -(-picture.shape[0] // rows), -(-picture.shape[1] // columns)  # of a cell
+    below, beside = rows * height - picture.shape[0], columns * width - picture.shape[1]
+    whole = cv2.copyMakeBorder(strength, 0, below, 0, beside, cv2.BORDER_CONSTANT)
+    cells = whole.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(rows, columns, -1)
+    v, u = np.nonzero(cells.max(axis=2) >= LEAST_CORNER)
+    down, across = np.divmod(cells.argmax(axis=2)[v, u], width)
+    return np.asarray(np.stack([u * width + across, v * height + down], axis=1)[:, None], dtype=np.float32)
+
+
+def _spread(corners: npt.NDArray[np.float32], picture: Image) -> float:
+    """Standard deviation of corners' places over the image's side, the larger of both axes; 0 for none."""
+    return float((corners.std(axis=(0, 1)) / picture.shape[::-1]).max()) if len(corners) else 0.0
+
+
+def _alike(flow: Array, shift: Array) -> npt.NDArray[np.bool_]:
+    """Whether each corner's flow is that of a shift [px of the reduced image]."""
+    return np.asarray((np.abs(flow - shift) <= AGREEMENT_PX / SCALE).all(axis=1))
 
 
 # Change against earlier images

@@ -88,6 +88,25 @@ def test_an_own_target_of_any_shape_is_found(size):
     assert len({track.id for each in right for track in each}) == 1
 
 
+@pytest.mark.parametrize(("size", "rough"), [((60, 150), 0.0), ((250, 100), 3.0)])
+def test_a_large_target_before_a_plain_wall_is_not_taken_for_the_cameras_motion(size, rough):
+    """Most corners in the image are the target's; the wall has none, or faint ones (grey levels)."""
+    rng, rate, width = np.random.default_rng(2), 25.0, size[0]
+    spots = cv2.GaussianBlur(rng.normal(0, 1, (480, 640 + width)), (0, 0), 2.0)
+    wall = np.repeat((150 + rough * spots / spots.std())[..., None], 3, axis=2)
+    places = [None] * 10 + [(5 * i, 150) for i in range(90)]  # it comes in from the left
+    detector = make_detector(TARGET, rate)
+    pictures = [picture[:, width:] for picture in moved(wall, texture(*size, rng), places)]
+    tracks = follow(pictures, rate, rng, detector)
+    right = [
+        on(each, np.array(place) - (width, 0) + np.array(size) / 2, 8)
+        for each, place in zip(tracks, places, strict=True)
+        if place and place[0] > width
+    ]
+    assert np.mean([bool(each) for each in right]) >= FOUND
+    assert np.abs(detector.shift).max() < 1
+
+
 def test_a_target_that_grows_from_a_speck_keeps_its_number():
     rng, rate = np.random.default_rng(3), 25.0
     background, lengths = scenery((640, 480), rng), np.geomspace(4, 320, 200)
