@@ -249,7 +249,7 @@ def run_on_folder(
     for i, ((film, _), boxes) in enumerate(zip(films, labels, strict=True)):
         progress(i, len(films), film.stem)
         table = tables / f"{film.stem}.csv"
-        summary = run_on_film(film, target, table)
+        summary = run_on_film(film, target, table, keep=True)
         tracks, frames = read_tracks(table), summary.last_frame + 1
         score = score_tracks(tracks, boxes, summary.rate_hz, frames, criterion=criterion)
         if min(boxes) < frames:  # otherwise no labelled frame is in the film

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from cotarget.cli.main import main
+from cotarget.detection import make_detector
 from cotarget.errors import ConfigError
 from cotarget.track_metrics import (
     Box,
@@ -270,6 +271,22 @@ def test_the_command_scores_a_film(tmp_path, capsys):
     assert found["false_tracks"] == 0
     assert found["offset_px_median"] < 1.5
     assert len(read_tracks(tmp_path / "tracks.csv")) >= 50
+
+
+@pytest.mark.parametrize(("more", "used"), [((), "speck"), (("--detector", "auto"), "auto")])
+def test_the_command_searches_with_the_detector_that_is_given(tmp_path, monkeypatch, more, used):
+    searched = []
+
+    def made(target, rate_hz):
+        searched.append(target.detector)
+        return make_detector(target, rate_hz)
+
+    monkeypatch.setattr("cotarget.detect_video.make_detector", made)
+    write_film(tmp_path / "film.mp4")
+    given = ["--target", "bird", "--csv", str(tmp_path / "tracks.csv"), *more]
+    assert main(["detect", str(tmp_path / "film.mp4"), *given]) == 0
+    assert searched == [used]
+    assert read_tracks(tmp_path / "tracks.csv")
 
 
 def test_tracks_in_a_small_film_are_drawn_in_an_enlarged_one(tmp_path):

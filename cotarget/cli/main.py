@@ -309,6 +309,8 @@ def _add_inspection(command: Command) -> None:
     _add_file(detect, "film", "video to search, or a folder of videos", "VIDEO")
     about = "a target of rig.toml, or one of book, person, bird"
     detect.add_argument("--target", required=True, metavar="NAME", help=about)
+    about = "search with this detector (that of the target)"
+    detect.add_argument("--detector", choices=("auto", "mog2", "motion", "speck"), help=about)
     about = (
         "write one line per confirmed track and frame, to stdout with -: u_px and v_px are the box's centre, the score "
         "is 0 where the box is only predicted; for a folder of videos, the folder for their tables"

@@ -26,6 +26,8 @@ from cotarget.errors import ConfigError
 from cotarget.files import STDOUT
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig, TargetProfile
     from cotarget.rig import Rig
@@ -184,18 +186,21 @@ def detect_command(options: argparse.Namespace) -> None:
     config = RigConfig() if options.rig is None else load_config(options.rig)
     with naming("--target"):
         target = config.target(options.target)
+    if options.detector is not None:
+        target = dataclasses.replace(target, detector=options.detector)
     criterion = Criterion(options.iou, options.small_px)
     if options.labels is None and criterion != Criterion():
         raise ConfigError("--iou, --small-px: compare tracks with --labels, which are missing")
+    inputs = rig_files(options.rig, config)
     if options.film.is_dir():
-        _detect_in_folder(options, target, criterion)
+        _detect_in_folder(options, target, criterion, inputs)
         return
     if options.sheet is not None:
         raise ConfigError(f"--sheet: shows the mistakes in a folder of videos, and {options.film} is none")
     if options.csv == STDOUT and options.labels is not None:
         raise ConfigError("--labels: scores the table of --csv; name its file, not -")
     table = None if options.csv == STDOUT else options.csv
-    check_outputs([table, options.video], [options.film, options.labels, *rig_files(options.rig, config)])
+    check_outputs([table, options.video], [options.film, options.labels, *inputs])
     labels = None if options.labels is None else labels_of_film(options.film, options.labels)
     with progress_bar() as progress:
         found = run_on_film(options.film, target, options.csv, options.video, progress, keep=True)
@@ -212,8 +217,10 @@ def detect_command(options: argparse.Namespace) -> None:
     warn_shortfall(options.film, found.shortfall)
 
 
-def _detect_in_folder(options: argparse.Namespace, target: "TargetProfile", criterion: "Criterion") -> None:
-    """Score the videos of a folder by the labels of another."""
+def _detect_in_folder(
+    options: argparse.Namespace, target: "TargetProfile", criterion: "Criterion", inputs: "list[Path | None]"
+) -> None:
+    """Score the videos of a folder by the labels of another; ``inputs`` are other files that are read."""
     from cotarget.detect_video import labelled_films, run_on_folder
     from cotarget.track_metrics import read_labels
 
@@ -227,7 +234,7 @@ def _detect_in_folder(options: argparse.Namespace, target: "TargetProfile", crit
         raise ConfigError(f"--csv: {options.csv} is no folder; give an existing one for the tables of the videos")
     films = labelled_films(options.film, options.labels)
     tables = [options.csv / f"{film.stem}.csv" for film, _ in films]
-    check_outputs([*tables, options.sheet], [path for pair in films for path in pair])
+    check_outputs([*tables, options.sheet], [*inputs, *(path for pair in films for path in pair)])
     with progress_bar() as progress:
         found = run_on_folder(films, target, options.csv, options.sheet, criterion, progress)
     print_json(found)

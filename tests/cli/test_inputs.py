@@ -46,6 +46,9 @@ def made(tmp_path_factory):
     (folder / "cover.png").write_bytes(b"a cover")
     (folder / "labels.csv").write_text("frame,x_px,y_px,width_px,height_px\n")
     bird_film(folder / "film.mp4", 5)
+    (folder / "films").mkdir()
+    bird_film(folder / "films" / "film.mp4", 5)
+    (folder / "films" / "film.csv").write_text("frame,x_px,y_px,width_px,height_px\n3,20,20,9,9\n")
     (folder / "link").symlink_to("rig.toml")
     (folder / "loop").symlink_to("loop")
     (folder / "way").symlink_to("run")
@@ -74,6 +77,7 @@ def contents(folder):
 FOLLOW = ("follow", "--rig", "rig.toml", "--calibration", "rig_calibration.json", "--target", "bird", "--seconds", "1")
 REPLAYED = ("follow", "--rig", "replay.toml", *FOLLOW[3:])
 DETECT = ("detect", "film.mp4", "--rig", "rig.toml", "--target", "bird", "--labels", "labels.csv", "--csv")
+IN_FOLDER = ("detect", "films", *DETECT[2:6], "--labels", "films", "--csv", "captures", "--sheet")
 CALIBRATE = ("calibrate", "--rig", "rig.toml")
 REFUSED = [
     *(((*FOLLOW, option), name) for option in ("--csv", "--video") for name in INPUTS if name not in DETECT),
@@ -83,6 +87,7 @@ REFUSED = [
     (("replay", "run", "--labels", "labels.csv", "--csv"), "labels.csv"),
     *((DETECT, name) for name in INPUTS if name != "rig_calibration.json"),
     *(((*DETECT, "new.csv", "--video"), name) for name in INPUTS if name != "rig_calibration.json"),
+    *((IN_FOLDER, name) for name in ("rig.toml", "hall.xml", "cover.png", "films/film.mp4", "films/film.csv")),
     *(((*CALIBRATE, "--out"), name) for name in ("rig.toml", "hall.xml", "stop", "cover.png", "link")),
     (("calibrate", "--rig", "replay.toml", "--out"), "run/log.jsonl"),
     (("calibrate", "--rig", "replay.toml", "--captures"), "run/captures"),
