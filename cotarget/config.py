@@ -453,8 +453,8 @@ class TargetProfile:
         size: true size of the dimension below [m].
         dimension: the dimension that ``size`` gives; a wingspan is the larger side of the target's box.
         wanted_px: size of that dimension in the close-up [px].
-        detector: how the fixed camera's images are searched: "auto" finds what moves or stands out, from a few pixels
-            to half the image, "colour" matches a template, "motion" subtracts the background, "speck" finds
+        detector: how the fixed camera's images are searched: "auto" finds what moves or stands out, from 3 px to half
+            the image's width, "colour" matches a template, "motion" subtracts the background, "speck" finds
             small targets by contrast and change, "mog2" is the paper's plain background subtraction, "onnx" is a neural
             network; or a function of your own from an image to boxes, in a module beside rig.toml or on Python's path.
         template: picture of the target, cut to its outline, for the detector "colour"; relative to rig.toml.

@@ -1,4 +1,4 @@
-"""Detect what moves or stands out, from a few pixels to half the image, of any kind.
+"""Detect what moves or stands out, from 3 px to half the image's width, of any kind.
 
 Two detectors search each image. `SmallTargetDetector` finds by contrast and change, and outlines what stands before a
 plain background to the pixel. `BackgroundDetector`, on an image of reduced size, finds large targets of many colours,
