@@ -1,0 +1,297 @@
+"""Targets of any shape, with no setting but their size: a car, a dog and a boat, simulated and drawn into real films.
+
+The simulated ones are MJCF models on the path of a walking person in the field of `experiments.following.field_scenes`.
+The composites are drawings of several colours on straight paths in real films. Both are searched by the default
+detector of a target of one's own. Boxes are exact; tracks and boxes are matched one to one, from frame 30 on, see
+`cotarget.track_metrics`.
+"""
+
+import itertools
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from cotarget.config import TargetProfile
+from cotarget.detect_video import FILMS
+from cotarget.detection import make_detector
+from cotarget.geometry import Array
+from cotarget.metrics import WHOLLY_VISIBLE
+from cotarget.rig import Frame, Image
+from cotarget.sim.targets.random_paths import lone_path
+from cotarget.sim.world import SimWorld
+from cotarget.track_metrics import LEARNING_FRAMES, Box, Label, Tracked, score_tracks
+from cotarget.tracking.track import tracking_settings
+from cotarget.tracking.tracker import Tracker, update_tracks
+from cotarget.video import Film
+from experiments.engine import Count, Row, Settings
+from experiments.following.field_scenes import field_config
+from experiments.following.films import DATA
+from experiments.following.wide_view import WIDE
+from experiments.tables import grouped
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WANTED = 0.95
+EVERY = 5  # the films of a folder that are taken: every fifth
+# Composites: larger side [px], speed [larger sides per second] and blur of the lens [px]; FINER times as fine as drawn.
+SIDE_PX, SPEED, BLUR_PX, FINER = (24.0, 120.0), (0.3, 1.5), 0.7, 8
+COME_S = 2.0  # by then the background of the simulated field was learnt, and the target is not yet in view [s]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A target's shape.
+
+    Attributes:
+        length_m: its length.
+        height_m: its height.
+        geoms: its parts, as MJCF [m] around its middle; x is forward, z up.
+        drawn: polygons in parts of its length around its middle (u, v), v down, each with its colour (BGR).
+    """
+
+    length_m: float
+    height_m: float
+    geoms: str
+    drawn: tuple[tuple[tuple[tuple[float, float], ...], tuple[int, int, int]], ...]
+
+
+def _round(u: float, v: float, radius: float) -> tuple[tuple[float, float], ...]:
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    return tuple((u + radius * float(np.cos(a)), v + radius * float(np.sin(a))) for a in turn)
+
+
+def _block(left: float, top: float, right: float, bottom: float) -> tuple[tuple[float, float], ...]:
+    return (left, top), (right, top), (right, bottom), (left, bottom)
+
+
+SHAPES: Mapping[str, Shape] = {
+    "car": Shape(
+        4.2,
+        1.4,
+        """<geom type="box" pos="0 0 -.15" size="2.1 .85 .35" rgba=".55 .1 .1 1"/>
+        <geom type="box" pos="-.2 0 .45" size="1.1 .75 .25" rgba=".1 .1 .15 1"/>
+        <geom type="cylinder" pos="1.3 0 -.4" euler="90 0 0" size=".3 .86" rgba=".05 .05 .05 1"/>
+        <geom type="cylinder" pos="-1.3 0 -.4" euler="90 0 0" size=".3 .86" rgba=".05 .05 .05 1"/>""",
+        (
+            (_block(-0.5, -0.05, 0.5, 0.1), (40, 40, 160)),
+            (((-0.3, -0.05), (-0.2, -0.17), (0.12, -0.17), (0.24, -0.05)), (60, 50, 40)),
+            (_round(-0.3, 0.1, 0.07), (20, 20, 20)),
+            (_round(0.3, 0.1, 0.07), (20, 20, 20)),
+        ),
+    ),
+    "dog": Shape(
+        1.0,
+        0.7,
+        """<geom type="box" pos="-.08 0 .05" size=".3 .12 .13" rgba=".35 .22 .1 1"/>
+        <geom type="box" pos=".36 0 .22" size=".14 .08 .1" rgba=".25 .15 .08 1"/>
+        <geom type="box" pos="-.44 0 .15" size=".06 .03 .03" rgba=".35 .22 .1 1"/>
+        <geom type="box" pos=".15 0 -.215" size=".04 .1 .135" rgba=".6 .5 .4 1"/>
+        <geom type="box" pos="-.31 0 -.215" size=".04 .1 .135" rgba=".6 .5 .4 1"/>""",
+        (
+            (_block(-0.4, -0.15, 0.25, 0.1), (30, 60, 100)),
+            (_block(0.2, -0.32, 0.5, -0.1), (25, 45, 70)),
+            (_block(-0.5, -0.2, -0.38, -0.12), (30, 60, 100)),
+            (_block(-0.35, 0.1, -0.25, 0.35), (110, 140, 170)),
+            (_block(0.1, 0.1, 0.2, 0.35), (110, 140, 170)),
+        ),
+    ),
+    "boat": Shape(
+        3.0,
+        1.2,
+        """<geom type="box" pos="0 0 -.4" size="1.5 .6 .2" rgba=".9 .9 .85 1"/>
+        <geom type="box" pos="-.5 0 0" size=".5 .45 .2" rgba=".2 .3 .5 1"/>
+        <geom type="box" pos=".2 0 .2" size=".04 .04 .4" rgba=".3 .2 .1 1"/>""",
+        (
+            (((-0.5, 0.0), (0.5, 0.0), (0.4, 0.13), (-0.45, 0.13)), (220, 230, 230)),
+            (_block(-0.33, -0.13, 0.0, 0.0), (130, 80, 50)),
+            (_block(0.06, -0.27, 0.09, 0.0), (40, 60, 90)),
+        ),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class OwnShapesSettings(Settings):
+    """Settings: scenes as seeds, each simulated and a film, folders of films, and most frames of each."""
+
+    seeds: Count = 10
+    folders: tuple[str, ...] = (str(DATA / "people"), str(DATA / "flyers"))
+    frames: Count = 300
+
+
+def needs(settings: OwnShapesSettings) -> str:
+    """Describe what is missing to run; empty if nothing."""
+    lacking = [folder for folder in settings.folders if not Path(folder).is_dir()]
+    return f"needs films in {lacking[0]}, which are not part of the project" if lacking else ""
+
+
+def _films(settings: OwnShapesSettings) -> list[Path]:
+    """List the films: every fifth of each folder."""
+    folders = [sorted(each for each in Path(folder).iterdir() if each.suffix in FILMS) for folder in settings.folders]
+    return [film for found in folders for film in found[::EVERY]]
+
+
+def jobs(settings: OwnShapesSettings) -> Sequence[int]:
+    """Give the scenes' numbers; one where there is no film."""
+    return range(1 if needs(settings) else min(settings.seeds, len(_films(settings))))
+
+
+def one(settings: OwnShapesSettings, number: int) -> list[Row]:
+    """Search for each shape in a simulation and in a film; give a row for each."""
+    rows = []
+    video = _films(settings)[number]
+    for name, shape in SHAPES.items():
+        target = TargetProfile(shape.length_m, "width", 160.0)
+        for source, (frames, labels, rate_hz) in {
+            "simulated": simulated(name, shape, number, settings.frames),
+            "composite": composite(video, shape, number, settings.frames),
+        }.items():
+            score = score_tracks(_tracks(target, frames, rate_hz), labels, rate_hz, len(frames))
+            rows.append(
+                {
+                    "seed": number,
+                    "film": video.stem if source == "composite" else "",
+                    "source": source,
+                    "shape": name,
+                    "boxes": score.boxes,
+                    "found": score.found,
+                    "side_px": float(np.median([each.larger_side_px for boxes in labels.values() for each in boxes])),
+                }
+            )
+    return rows
+
+
+def _tracks(target: TargetProfile, frames: Sequence[Frame], rate_hz: float) -> list[Tracked]:
+    """Follow what the target's detector finds; give the confirmed tracks of every frame."""
+    detector = make_detector(target, rate_hz)
+    tracker = Tracker(tracking_settings(target), frames[0].image.shape[1::-1])
+    found = []
+    for index, frame in enumerate(frames):
+        tracks = update_tracks(tracker, detector.detect(frame), frame.t, detector)
+        found += [Tracked(e.center_px, e.size_px, index, frame.t, e.id) for e in tracks if e.confirmed]
+    return found
+
+
+Scene = tuple[list[Frame], dict[int, list[Label]], float]  # frames, labels by frame number, frame rate [Hz]
+
+
+def simulated(name: str, shape: Shape, seed: int, most: int) -> Scene:
+    """Render a shape on a person's path; it has a label while it is wholly visible."""
+    (path,) = lone_path("person", seed).values()
+    with tempfile.TemporaryDirectory() as folder:
+        model = Path(folder, f"{name}.xml")
+        model.write_text(f"<mujoco><worldbody><body>{shape.geoms}</body></worldbody></mujoco>")
+        config = field_config({name: tuple((t, x, y, shape.height_m / 2) for t, x, y, _ in path)}, seed)
+        sim = replace(config.sim, models={name: model})
+        world = SimWorld(replace(config, sim=sim), rendered=WIDE)
+    truth, frames, labels, rate_hz = world.truth(), list[Frame](), dict[int, list[Label]](), sim.fixed.rate_hz
+    t = COME_S - LEARNING_FRAMES / rate_hz
+    with world.rig as rig:
+        rig.clock.sleep_until(t)
+        for index in range(most):
+            frame = rig.fixed.read(newer_than=t)
+            t = frame.t
+            outline = truth.silhouette(name, "fixed", t)
+            if outline is not None and outline.visible >= WHOLLY_VISIBLE:
+                labels[index] = [Label((outline.low_px + outline.high_px) / 2, outline.size_px)]
+            frames.append(frame)
+    return frames, labels, rate_hz
+
+
+def composite(video: Path, shape: Shape, seed: int, most: int) -> Scene:
+    """Draw a shape into a film, on a straight path that turns round at the border."""
+    rng = np.random.default_rng(seed)
+    with Film(video) as film:
+        frames, rate_hz = list(itertools.islice(film, most)), film.rate_hz
+    side, speed = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in (SIDE_PX, SPEED))
+    size = np.array(frames[0].image.shape[1::-1])
+    room, way = size - 1.2 * side, rng.uniform(-0.3, 0.3)
+    steps = np.outer(np.arange(len(frames)) / rate_hz, side * speed * np.array([np.cos(way), np.sin(way)]))
+    unfolded = (rng.uniform(0, 1, 2) * room + steps) % (2 * room)
+    places = 0.6 * side + np.minimum(unfolded, 2 * room - unfolded)
+    made, labels = [], {}
+    for index, (frame, center, ahead) in enumerate(zip(frames, places, unfolded[:, 0] < room[0], strict=True)):
+        image = frame.image.copy()
+        box = draw_shape(image, shape, center, side if ahead else -side)
+        made.append(replace(frame, image=image))
+        labels[index] = [Label(box.center_px, box.size_px)]
+    return made, labels, rate_hz
+
+
+def draw_shape(image: Image, shape: Shape, center_px: Array, length_px: float) -> Box:
+    """Draw a shape into an image.
+
+    Args:
+        image: changed in place, (H, W, 3).
+        shape: the shape.
+        center_px: where its middle is (u, v), (2,).
+        length_px: its length; negative if it looks to the left.
+
+    Returns:
+        Exact box before the lens blurs it.
+    """
+    parts = [(center_px + np.array(polygon) * (length_px, abs(length_px)), colour) for polygon, colour in shape.drawn]
+    corners = np.vstack([polygon for polygon, _ in parts])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = np.ceil(3 * BLUR_PX)
+    limit = np.array(image.shape[1::-1])
+    (left, top), (right, bottom) = (
+        np.clip(np.rint(edge), 0, limit).astype(int) for edge in (low - margin, high + margin + 1)
+    )
+    size = right - left, bottom - top
+    # The last channel is how much of a pixel is covered.
+    fine = np.zeros((size[1] * FINER, size[0] * FINER, 4), dtype=np.float32)
+    for polygon, colour in parts:
+        pixels = np.rint((polygon - (left, top) + 0.5) * FINER - 0.5).astype(np.int32)
+        cv2.fillPoly(fine, [pixels], (*colour, 1.0))
+    blurred = cv2.resize(cv2.GaussianBlur(fine, None, BLUR_PX * FINER), size, interpolation=cv2.INTER_AREA)
+    drawn, covered = blurred[..., :3], blurred[..., 3:]
+    image[top:bottom, left:right] = np.rint((1 - covered) * image[top:bottom, left:right] + drawn).clip(0, 255)
+    return Box((low + high) / 2, high - low)
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Give boxes and recall of each source and shape, and the range of the scenes' median larger sides [px]."""
+    return {
+        f"{source}: {shape}": {
+            "boxes": sum(row["boxes"] for row in mine),
+            "recall": sum(row["found"] for row in mine) / sum(row["boxes"] for row in mine),
+            "least_px": min(row["side_px"] for row in mine),
+            "largest_px": max(row["side_px"] for row in mine),
+        }
+        for (source, shape), mine in sorted(grouped(rows, "source", "shape").items())
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """List the shapes that are found too seldom."""
+    return [
+        f"{name}: recall {figures['recall']:.3f}, not {WANTED:g} or more"
+        for name, figures in summary.items()
+        if not figures["recall"] >= WANTED
+    ]
+
+
+def plot(rows: Sequence[Row], figure: "Figure") -> None:
+    """Recall of each scene over the target's larger side."""
+    axes = figure.subplots()
+    for (source, shape), mine in sorted(grouped(rows, "source", "shape").items()):
+        axes.plot(
+            [row["side_px"] for row in mine],
+            [row["found"] / row["boxes"] for row in mine],
+            "o" if source == "simulated" else "x",
+            label=f"{source}: {shape}",
+        )
+    axes.set(xscale="log", xlabel="larger side [px]", ylabel="recall", ylim=(0, 1.02))
+    axes.legend()
+
+
+SETTINGS = OwnShapesSettings()
+QUICK = replace(SETTINGS, seeds=1, frames=75)
+COST_S = 60.0
