@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from cotarget.detection.background import LARGE, BackgroundDetector
 from cotarget.detection.base import Detection
-from cotarget.detection.small_target import SmallTargetDetector
+from cotarget.detection.small_target import WEIGHTS, SmallTargetDetector, Weights
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
@@ -59,9 +59,14 @@ MOST_GAIN = 0.1
 class AutoDetector:
     """Detect small targets by contrast and change, and large ones by a background model."""
 
-    def __init__(self, rate_hz: float) -> None:
-        """Start without history and background; ``rate_hz`` is the nominal frame rate [Hz]."""
-        self._small = SmallTargetDetector(LEAST_SCORE)
+    def __init__(self, rate_hz: float, weights: Weights = WEIGHTS) -> None:
+        """Start without history and background.
+
+        Args:
+            rate_hz: nominal frame rate [Hz].
+            weights: of the score of small targets, see `cotarget.detection.small_target.small_target_score`.
+        """
+        self._small = SmallTargetDetector(LEAST_SCORE, weights)
         self._large = BackgroundDetector(LARGE, rate_hz)
         self._clutter = Clutter()
         self._width = 0

@@ -342,6 +342,7 @@ class SmallTarget:
         signal: absolute contrast, in standard deviations of the surroundings.
         around: mean grey level of the surroundings.
         beside: largest texture beside it [grey levels]: little in the sky, much at a mast or a twig; inf if unknown.
+        since: its change since each of `AGES_S`, nan if unknown; () if it was not compared.
     """
 
     low: tuple[int, int]
@@ -350,6 +351,7 @@ class SmallTarget:
     signal: float
     around: float
     beside: float = 0.0
+    since: tuple[float, ...] = ()
 
 
 def find_small_targets(
@@ -630,7 +632,8 @@ STANDING_CHANGE = (0.05, 0.08, 0.15, 0.20)
 LEAST_CHANGE = 0.02
 # The score is the logistic function of these times the logarithms of signal, change and texture beside the target, plus
 # the last. They were fitted to 41 labelled films, with target and others taken as equally likely in every film.
-OF_SIGNAL, OF_CHANGE, OF_TEXTURE, EVEN = 2.57, 3.14, -1.44, -3.52
+Weights = tuple[float, float, float, float]
+WEIGHTS: Weights = (2.57, 3.14, -1.44, -3.52)
 # Largest signal that counts: a stronger one does not make up for a lack of change.
 CLEAR_SIGNAL = 30.0
 # Steepness of the score of a region of the difference.
@@ -673,9 +676,9 @@ WARM_UP_S, AFTER_CUT_S = 0.09, AGES_S[1]
 class SmallTargetDetector:
     """Detect small targets by contrast and change, each with a score."""
 
-    def __init__(self, least_score: float = LEAST_SCORE) -> None:
+    def __init__(self, least_score: float = LEAST_SCORE, weights: Weights = WEIGHTS) -> None:
         """Start without history; ``least_score`` is that of a detection."""
-        self._least_score = least_score
+        self._least_score, self._weights = least_score, weights
         self.camera = CameraMotion()
         self._history = History()
         self._warm_up_s = WARM_UP_S
@@ -725,7 +728,8 @@ class SmallTargetDetector:
             low = target.low[0] // unit, target.low[1] // unit
             size = -(-target.size[0] // unit), -(-target.size[1] // unit)
             since = changes(grey, low, size, target.around, shift, self._history.noise, references)
-            score = small_target_score(target.signal, since, target.beside)
+            target = replace(target, since=tuple(since))
+            score = small_target_score(target.signal, since, target.beside, self._weights)
             detection = _boxed(target, score, shape, times)
             if detection.score >= self._least_score:
                 found.append((target, detection))
@@ -836,26 +840,27 @@ def _best_of(found: list[tuple[SmallTarget, Detection]]) -> list[tuple[SmallTarg
     return kept
 
 
-def small_target_score(signal: float, since: Sequence[float], beside: float) -> float:
+def small_target_score(signal: float, since: Sequence[float], beside: float, weights: Weights = WEIGHTS) -> float:
     """Probability that a region is a target and not a standing thing, 0 to 1.
 
     Args:
         signal: contrast in standard deviations of the surroundings.
         since: change since each of AGES_S, nan if unknown.
         beside: largest texture beside the region [grey levels].
+        weights: of the logarithms of signal, change and texture, and the constant.
     """
+    found = evidence(signal, since, beside)
+    return 0.0 if found is None else 1 / (1 + math.exp(-float(np.dot(weights, (*found, 1.0)))))
+
+
+def evidence(signal: float, since: Sequence[float], beside: float) -> tuple[float, float, float] | None:
+    """Logarithms of signal, change and texture; None without any change. Arguments as for `small_target_score`."""
     ratios = [
         math.log((c + LEAST_CHANGE) / (usual + LEAST_CHANGE))
         for c, usual in zip(since, STANDING_CHANGE, strict=True)
         if not math.isnan(c)
     ]
     if not ratios:
-        return 0.0
+        return None
     ratios = [min(ratio, ratios[0] + MOST_RISE) for ratio in ratios]
-    logit = (
-        OF_SIGNAL * math.log(min(signal, CLEAR_SIGNAL))
-        + OF_CHANGE * sum(ratios) / len(ratios)
-        + OF_TEXTURE * math.log1p(beside)
-        + EVEN
-    )
-    return 1 / (1 + math.exp(-logit))
+    return math.log(min(signal, CLEAR_SIGNAL)), sum(ratios) / len(ratios), math.log1p(beside)

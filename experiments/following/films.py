@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from cotarget.config import DEFAULT_TARGETS, DetectorName
+from cotarget.config import DEFAULT_TARGETS, DetectorName, TargetProfile
 from cotarget.detect_video import labelled_films
-from cotarget.detection import Detection, make_detector
+from cotarget.detection import Detection, Detector, make_detector
 from cotarget.detection.background import pieces
 from cotarget.detection.base import box_detection
 from cotarget.files import read_table
@@ -147,7 +147,14 @@ def detector_tracks(
 ) -> dict[float, list[Tracked]]:
     """Track what a detector finds, for each score from which a track is confirmed; the usual one holds."""
     target = replace(DEFAULT_TARGETS["bird"], detector=name)
-    detector, usual = make_detector(target, rate_hz), tracking_settings(target)
+    return tracks_of(make_detector(target, rate_hz), target, scores, frames)
+
+
+def tracks_of(
+    detector: Detector, target: TargetProfile, scores: Sequence[float], frames: Sequence[Frame]
+) -> dict[float, list[Tracked]]:
+    """Track what a detector of a target finds, as `detector_tracks` does."""
+    usual = tracking_settings(target)
     size = frames[0].image.shape[1], frames[0].image.shape[0]
     own = Tracker(usual, size)
     trackers = {least: Tracker(replace(usual, confirm_score=least), size) for least in scores}

@@ -1,12 +1,11 @@
 """Targets of any shape, with no setting but their size: a car, a dog and a boat, simulated and drawn into real films.
 
 The simulated ones are MJCF models on the path of a walking person in the field of `experiments.following.field_scenes`.
-The composites are drawings of several colours on straight paths in real films. Both are searched by the default
+The composites are drawings of several colours that cross real films. Both are searched by the default
 detector of a target of one's own. Boxes are exact; tracks and boxes are matched one to one, from frame 30 on, see
 `cotarget.track_metrics`.
 """
 
-import itertools
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,6 @@ import cv2
 import numpy as np
 
 from cotarget.config import TargetProfile
-from cotarget.detect_video import FILMS
 from cotarget.detection import make_detector
 from cotarget.geometry import Array
 from cotarget.metrics import WHOLLY_VISIBLE
@@ -27,10 +25,10 @@ from cotarget.sim.world import SimWorld
 from cotarget.track_metrics import LEARNING_FRAMES, Box, Label, Tracked, score_tracks
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker, update_tracks
-from cotarget.video import Film
 from experiments.engine import Count, Row, Settings
+from experiments.following import films
 from experiments.following.field_scenes import field_config
-from experiments.following.films import DATA
+from experiments.following.films import FilmsSettings, LabelledFilm, labelled_film
 from experiments.following.wide_view import WIDE
 from experiments.tables import grouped
 
@@ -38,9 +36,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WANTED = 0.95
-EVERY = 5  # the films of a folder that are taken: every fifth
-# Composites: larger side [px], speed [larger sides per second] and blur of the lens [px]; FINER times as fine as drawn.
-SIDE_PX, SPEED, BLUR_PX, FINER = (24.0, 120.0), (0.3, 1.5), 0.7, 8
+EVERY = 5  # the labelled films that are taken: every fifth
+# Composites: length [px], speed [lengths per second], number of heights of which the farthest from labels is taken, and
+# blur of the lens [px]; they are drawn FINER times as fine.
+SIDE_PX, SPEED, HEIGHTS, BLUR_PX, FINER = (24.0, 120.0), (0.5, 2.0), 50, 0.7, 8
 COME_S = 2.0  # by then the background of the simulated field was learnt, and the target is not yet in view [s]
 
 
@@ -118,23 +117,21 @@ SHAPES: Mapping[str, Shape] = {
 
 @dataclass(frozen=True)
 class OwnShapesSettings(Settings):
-    """Settings: scenes as seeds, each simulated and a film, folders of films, and most frames of each."""
+    """Settings: scenes as seeds, each simulated and a film, folders of films with labels, most frames of each."""
 
-    seeds: Count = 10
-    folders: tuple[str, ...] = (str(DATA / "people"), str(DATA / "flyers"))
-    frames: Count = 300
+    seeds: Count = 6
+    folders: tuple[str, ...] = FilmsSettings.folders
+    frames: Count = 250
 
 
 def needs(settings: OwnShapesSettings) -> str:
     """Describe what is missing to run; empty if nothing."""
-    lacking = [folder for folder in settings.folders if not Path(folder).is_dir()]
-    return f"needs films in {lacking[0]}, which are not part of the project" if lacking else ""
+    return films.needs(FilmsSettings(folders=settings.folders))
 
 
-def _films(settings: OwnShapesSettings) -> list[Path]:
-    """List the films: every fifth of each folder."""
-    folders = [sorted(each for each in Path(folder).iterdir() if each.suffix in FILMS) for folder in settings.folders]
-    return [film for found in folders for film in found[::EVERY]]
+def _films(settings: OwnShapesSettings) -> list[tuple[Path, Path]]:
+    """List the films that are taken, with their labels."""
+    return films.films(FilmsSettings(folders=settings.folders))[::EVERY]
 
 
 def jobs(settings: OwnShapesSettings) -> Sequence[int]:
@@ -145,18 +142,18 @@ def jobs(settings: OwnShapesSettings) -> Sequence[int]:
 def one(settings: OwnShapesSettings, number: int) -> list[Row]:
     """Search for each shape in a simulation and in a film; give a row for each."""
     rows = []
-    video = _films(settings)[number]
+    film = labelled_film(*_films(settings)[number])
     for name, shape in SHAPES.items():
         target = TargetProfile(shape.length_m, "width", 160.0)
         for source, (frames, labels, rate_hz) in {
             "simulated": simulated(name, shape, number, settings.frames),
-            "composite": composite(video, shape, number, settings.frames),
+            "composite": composite(film, shape, number, settings.frames),
         }.items():
             score = score_tracks(_tracks(target, frames, rate_hz), labels, rate_hz, len(frames))
             rows.append(
                 {
                     "seed": number,
-                    "film": video.stem if source == "composite" else "",
+                    "film": film.name if source == "composite" else "",
                     "source": source,
                     "shape": name,
                     "boxes": score.boxes,
@@ -204,24 +201,23 @@ def simulated(name: str, shape: Shape, seed: int, most: int) -> Scene:
     return frames, labels, rate_hz
 
 
-def composite(video: Path, shape: Shape, seed: int, most: int) -> Scene:
-    """Draw a shape into a film, on a straight path that turns round at the border."""
+def composite(film: LabelledFilm, shape: Shape, seed: int, most: int) -> Scene:
+    """Draw a shape that crosses a film at a height far from its labels; it has a label while it is whole."""
     rng = np.random.default_rng(seed)
-    with Film(video) as film:
-        frames, rate_hz = list(itertools.islice(film, most)), film.rate_hz
     side, speed = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in (SIDE_PX, SPEED))
-    size = np.array(frames[0].image.shape[1::-1])
-    room, way = size - 1.2 * side, rng.uniform(-0.3, 0.3)
-    steps = np.outer(np.arange(len(frames)) / rate_hz, side * speed * np.array([np.cos(way), np.sin(way)]))
-    unfolded = (rng.uniform(0, 1, 2) * room + steps) % (2 * room)
-    places = 0.6 * side + np.minimum(unfolded, 2 * room - unfolded)
-    made, labels = [], {}
-    for index, (frame, center, ahead) in enumerate(zip(frames, places, unfolded[:, 0] < room[0], strict=True)):
-        image = frame.image.copy()
-        box = draw_shape(image, shape, center, side if ahead else -side)
+    frames, way = film.frames[:most], rng.choice([-1, 1])
+    width, height = frames[0].image.shape[1::-1]
+    taken = np.array([label.center_px[1] for boxes in film.labels.values() for label in boxes])
+    v = max(rng.uniform(side, height - side, HEIGHTS), key=lambda v: np.abs(taken - v).min())
+    made, labels = list[Frame](), dict[int, list[Label]]()
+    for index, frame in enumerate(frames):
+        image, along = frame.image.copy(), side * speed * index / film.rate_hz - side / 2
+        box = draw_shape(image, shape, np.array([along if way > 0 else width - 1 - along, v]), way * side)
         made.append(replace(frame, image=image))
-        labels[index] = [Label(box.center_px, box.size_px)]
-    return made, labels, rate_hz
+        low, high = box.center_px - box.size_px / 2, box.center_px + box.size_px / 2
+        if low[0] >= -0.5 and high[0] <= width - 0.5:
+            labels[index] = [Label(box.center_px, box.size_px)]
+    return made, labels, film.rate_hz
 
 
 def draw_shape(image: Image, shape: Shape, center_px: Array, length_px: float) -> Box:
@@ -239,12 +235,14 @@ def draw_shape(image: Image, shape: Shape, center_px: Array, length_px: float) -
     parts = [(center_px + np.array(polygon) * (length_px, abs(length_px)), colour) for polygon, colour in shape.drawn]
     corners = np.vstack([polygon for polygon, _ in parts])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = np.ceil(3 * BLUR_PX)
-    limit = np.array(image.shape[1::-1])
+    box = Box((low + high) / 2, high - low)
+    margin, limit = np.ceil(3 * BLUR_PX), np.array(image.shape[1::-1])
     (left, top), (right, bottom) = (
         np.clip(np.rint(edge), 0, limit).astype(int) for edge in (low - margin, high + margin + 1)
     )
     size = right - left, bottom - top
+    if not all(size):
+        return box  # outside the image
     # The last channel is how much of a pixel is covered.
     fine = np.zeros((size[1] * FINER, size[0] * FINER, 4), dtype=np.float32)
     for polygon, colour in parts:
@@ -253,7 +251,7 @@ def draw_shape(image: Image, shape: Shape, center_px: Array, length_px: float) -
     blurred = cv2.resize(cv2.GaussianBlur(fine, None, BLUR_PX * FINER), size, interpolation=cv2.INTER_AREA)
     drawn, covered = blurred[..., :3], blurred[..., 3:]
     image[top:bottom, left:right] = np.rint((1 - covered) * image[top:bottom, left:right] + drawn).clip(0, 255)
-    return Box((low + high) / 2, high - low)
+    return box
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:

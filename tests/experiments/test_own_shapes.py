@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from cotarget.track_metrics import LEARNING_FRAMES
-from cotarget.video import FilmWriter
+from cotarget.rig import Frame
+from cotarget.track_metrics import Label
+from experiments.following.films import LabelledFilm
 from experiments.following.own_shapes import SHAPES, composite, draw_shape, missed, summarise
 
 EDGE_PX = 0.7  # the lens blurs edges by as much
@@ -24,20 +25,20 @@ def test_a_drawing_is_where_its_box_says_and_looks_ahead(name, length):
     assert np.sign(u[v == v.min()].mean() - 70.4) == higher * np.sign(length)
 
 
-def test_a_composite_moves_in_its_film_and_turns_round_at_the_border(tmp_path):
-    with FilmWriter(tmp_path / "wall.mp4", 25.0) as film:
-        for i in range(200):
-            film.write(np.full((240, 320, 3), 128, np.uint8), i / 25)
-    frames, labels, rate = composite(tmp_path / "wall.mp4", SHAPES["car"], 3, 200)
-    assert (len(frames), len(labels), rate) == (200, 200, 25.0)
-    low = np.array([label.center_px - label.size_px / 2 for (label,) in labels.values()])
-    high = np.array([label.center_px + label.size_px / 2 for (label,) in labels.values()])
-    assert low.min() >= -0.5
-    assert (high <= (319.5, 239.5)).all()
-    assert np.ptp(low[:, 0]) > labels[0][0].size_px[0]
-    for i in (0, LEARNING_FRAMES, 199):
-        u, v = np.rint(labels[i][0].center_px).astype(int)
-        assert np.abs(frames[i].image[v, u].astype(int) - 128).max() > 40
+def test_a_composite_crosses_its_film_far_from_labels():
+    frames = [Frame(np.full((240, 320, 3), 128, np.uint8), i / 25) for i in range(250)]
+    taken = {i: [Label(np.array([160.0, 60.0]), np.array([10.0, 10.0]))] for i in range(250)}
+    made, labels, rate = composite(LabelledFilm("wall", frames, 25.0, taken, {}), SHAPES["car"], 3, 240)
+    assert (len(made), rate) == (240, 25.0)
+    assert min(labels) > 0  # it comes in
+    for i, (label,) in labels.items():
+        low, high = label.center_px - label.size_px / 2, label.center_px + label.size_px / 2
+        assert low.min() >= -0.5
+        assert (high <= (319.5, 239.5)).all()
+        assert abs(label.center_px[1] - 60) > 90
+        u, v = np.rint(label.center_px).astype(int)
+        assert np.abs(made[i].image[v, u].astype(int) - 128).max() > 40
+    assert np.abs(labels[max(labels)][0].center_px[0] - labels[min(labels)][0].center_px[0]) > label.size_px[0]
 
 
 def test_recall_is_over_the_boxes_of_all_scenes():

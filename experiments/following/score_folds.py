@@ -1,0 +1,148 @@
+"""The score of small targets on films that it was not fitted to.
+
+The weights of `cotarget.detection.small_target.small_target_score` are fitted to four fifths of the labelled films of
+`experiments.following.films`, and the others are searched with them and with the usual weights. Films that follow each
+other by name are in one fifth, because they often show one place and day, and one kind of flyer.
+
+A region that the detector examines in a labelled frame is a target if it is on a label. Logistic regression takes
+targets and others as equally likely in every film.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit, xlogy
+
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.detection import AutoDetector, SmallTargetDetector
+from cotarget.detection.small_target import WEIGHTS, Weights, evidence
+from cotarget.geometry import Array
+from cotarget.track_metrics import LEARNING_FRAMES, Box, Criterion
+from cotarget.tracking.track import tracking_settings
+from experiments.engine import Count, Row, Settings
+from experiments.following import films
+from experiments.following.films import FilmsSettings, LabelledFilm, labelled_film, tracks_of
+from experiments.tables import grouped
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FOLDS = 5
+WITHIN = 0.01  # of the recall with the usual weights
+USUAL, OTHERS = "usual weights", "weights of the other films"
+TARGET = replace(DEFAULT_TARGETS["bird"], detector="auto")
+
+
+@dataclass(frozen=True)
+class ScoreFoldsSettings(Settings):
+    """Settings: fifths of the films, as seeds, folders of films with their labels, and which films are used."""
+
+    seeds: Count = FOLDS
+    folders: tuple[str, ...] = FilmsSettings.folders
+    every: Count = 1  # 2 for every second film, and so on
+
+
+def needs(settings: ScoreFoldsSettings) -> str:
+    """Describe what is missing to run; empty if nothing."""
+    return films.needs(FilmsSettings(folders=settings.folders))
+
+
+def one(settings: ScoreFoldsSettings, number: int) -> list[Row]:
+    """Fit the weights without a fifth of the films, and search these; give a row for each film and weights."""
+    found = films.films(FilmsSettings(folders=settings.folders))[:: settings.every]
+    held_out = np.array_split(np.arange(len(found)), FOLDS)[number]
+    weights = fit([examined(labelled_film(*pair)) for i, pair in enumerate(found) if i not in held_out])
+    rows = []
+    for i in held_out.tolist():
+        film = labelled_film(*found[i])
+        for name, used in ((USUAL, WEIGHTS), (OTHERS, weights)):
+            rows.append({"seed": number, **_searched(film, name, used)})
+    return rows
+
+
+def _searched(film: LabelledFilm, name: str, weights: Weights) -> Row:
+    least = tracking_settings(TARGET).confirm_score
+    tracks = tracks_of(AutoDetector(film.rate_hz, weights), TARGET, (least,), film.frames)[least]
+    columns = dict(zip(("signal", "change", "texture", "constant"), weights, strict=True))
+    return film.row(name, least, 0, tracks) | columns
+
+
+def examined(film: LabelledFilm) -> tuple[Array, Array]:
+    """Give the evidence of each region examined in labelled frames, (n, 3), and whether it is on a label, (n,)."""
+    detector, seen, on = SmallTargetDetector(0.0), list[Any](), list[bool]()
+    for index, frame in enumerate(film.frames):
+        found = detector.find(frame)
+        if index < LEARNING_FRAMES or not film.labels.get(index):
+            continue
+        for target, detection in found:
+            box = Box(detection.center_px, detection.size_px)
+            if not target.since or detection.clipped or _is_on(box, film.flyers.get(index, ())):
+                continue
+            logarithms = evidence(target.signal, target.since, target.beside)
+            if logarithms is not None:
+                seen.append(logarithms)
+                on.append(_is_on(box, film.labels[index]))
+    return np.reshape(seen, (-1, 3)), np.array(on, dtype=bool)
+
+
+def _is_on(box: Box, boxes: Sequence[Box]) -> bool:
+    """Whether a box is on one of some boxes."""
+    criterion = Criterion()
+    return bool((criterion.similarity(boxes, [box]) >= criterion.iou).any())
+
+
+def fit(found: Sequence[tuple[Array, Array]]) -> Weights:
+    """Fit the weights to regions of films by logistic regression.
+
+    Args:
+        found: for each film the logarithms of signal, change and texture, (n, 3), and which are targets, (n,).
+    """
+    both = [(seen, on) for seen, on in found if on.any() and not on.all()]
+    x = np.column_stack([np.vstack([seen for seen, _ in both]), np.ones(sum(len(on) for _, on in both))])
+    y = np.concatenate([on for _, on in both]).astype(float)
+    share = np.concatenate([0.5 * np.where(on, 1 / on.sum(), 1 / (1 - on).sum()) for _, on in both]) / len(both)
+
+    def loss(weights: Array) -> tuple[float, Array]:
+        p = expit(x @ weights)
+        return float(-(share * (xlogy(y, p) + xlogy(1 - y, expit(-(x @ weights))))).sum()), x.T @ (share * (p - y))
+
+    signal, change, texture, constant = minimize(loss, np.array(WEIGHTS), jac=True, method="BFGS").x.tolist()
+    return signal, change, texture, constant
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Give recall and false tracks a minute with either weights, over all films, and the range of the weights."""
+    figures = {}
+    for way, mine in grouped(rows, "way").items():
+        boxes, minutes = (sum(row[name] for row in mine) for name in ("boxes", "minutes"))
+        figures[way] = {
+            "recall": sum(row["found"] for row in mine) / boxes,
+            "false tracks a minute": sum(row["false_tracks"] for row in mine) / minutes,
+            "the same, no flyer": sum(row["no_flyer"] for row in mine) / minutes,
+        }
+        for name in ("signal", "change", "texture", "constant"):
+            figures[way] |= {f"least {name}": min(r[name] for r in mine), f"largest {name}": max(r[name] for r in mine)}
+    return figures
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """State the recall on films that were not fitted, if it is farther off than wanted."""
+    usual, others = (summary[way]["recall"] for way in (USUAL, OTHERS))
+    return [] if abs(usual - others) <= WITHIN else [f"recall {others:.3f} with {OTHERS}, {usual:.3f} with {USUAL}"]
+
+
+def plot(rows: Sequence[Row], figure: "Figure") -> None:
+    """Recall of each film with the weights of the other films over that with the usual weights."""
+    axes, found = figure.subplots(), grouped(rows, "way")
+    recalls = [[row["found"] / max(1, row["boxes"]) for row in found[way]] for way in (USUAL, OTHERS)]
+    axes.plot(*recalls, "o")
+    axes.plot([0, 1], [0, 1], "k:")
+    axes.set(xlabel=f"recall, {USUAL}", ylabel=f"recall, {OTHERS}")
+
+
+SETTINGS = ScoreFoldsSettings()
+QUICK = replace(SETTINGS, seeds=1, every=23)
+COST_S = 300.0
