@@ -2,8 +2,8 @@
 
 In each labelled frame, tracks and labels are matched one to one, as the CLEAR MOT metrics have it (Bernardin and
 Stiefelhagen 2008): the pairs of the frame before stay as long as they are near enough, the others are assigned by
-similarity. IDF1 is that of Ristani et al. (2016). Frames without labels say nothing, except of a track that is never on
-a label.
+similarity. IDF1 is that of Ristani et al. (2016). Frames without labels are not scored. Only a track that is never on a
+label counts as false in them.
 """
 
 import math

@@ -38,9 +38,10 @@ LARGE_PART, SHAKE_PART, VIEW_PART, QUIET_PART = 24 / 640, 3 / 640, 0.1, 0.5 / 64
 STEADY_S = 0.2
 # Largest texture beside a target before a plain background [grey levels].
 PLAIN = 5.0
-# A small target that covers the first part of a large one is the same target; one of which the large one covers less
-# than the second part is much larger.
-SAME, MOST = 0.6, 0.4
+# Part of a large target that a small one covers if they are the same target.
+SAME = 0.6
+# Part of a small target that the large one covers at most, if the small one is much larger.
+MOST = 0.4
 # A track follows a small target if their larger sides differ by less than the first factor. Inside a large target whose
 # area is larger by more than the second factor, it is then another target, such as a bird before a cloud.
 SIDE_RATIO, AREA_RATIO = 2.0, 4.0

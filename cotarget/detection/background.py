@@ -44,7 +44,7 @@ class BackgroundSettings:
         largest: largest side of a target as a part of the image's.
         flat: parts of a wide component thinner than this part of its height lie on the ground, such as the edge of a
             shadow, and are no part of the target; 0 for none.
-        rim_px: so far beside what the opening leaves, thinner foreground belongs to it: feet and rotors.
+        rim_px: thinner foreground within this distance of what the opening leaves is kept: feet and rotors.
         edged: whether a target must have a sharp edge in the image, unlike a cloud or the place that one has left.
         image_px: images are halved until they are at most this wide; 0 for never. All lengths are in pixels of the
             result.

@@ -21,7 +21,7 @@ from cotarget.rig import Image
 
 # Grey level of the letterbox's padding, as YOLO networks are trained.
 PADDING = 114
-# Two boxes with a larger intersection over union are one target, and at most so many boxes are compared.
+# Two boxes with a larger intersection over union are one target; at most MOST_BOXES boxes are compared.
 SAME_IOU, MOST_BOXES = 0.5, 1000
 # Least part of its side that a tile shares with the next one. Targets up to it are seen whole in a tile.
 SHARED = 0.25

@@ -784,14 +784,14 @@ class SmallTargetDetector:
             scales=SCALES_OF_DIFFERENCE,
             of_difference=True,
         ):
-            score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE)) if target.contrast > 0 else 0.0
+            if target.contrast <= 0:
+                continue
+            score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE))
             (x, y), (w, h) = target.low, target.size
             target = replace(
                 target, low=(pixel * (left + x), pixel * (top + y)), size=(pixel * w, pixel * h), beside=math.inf
             )
-            detection = _boxed(target, score, (unit * grey.shape[0], unit * grey.shape[1]), times)
-            if detection.score >= LEAST_SCORE:
-                found.append((target, detection))
+            found.append((target, _boxed(target, score, (unit * grey.shape[0], unit * grey.shape[1]), times)))
         return found
 
 

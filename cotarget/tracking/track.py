@@ -376,7 +376,7 @@ class LiveTrack:
         self.missed = 0
         self.confirmed = False
         self.is_part = False  # whether it lies in a larger confirmed track
-        self.is_doubtful = False  # whether the film was cut since the last detection
+        self.after_cut = False  # whether the film was cut since the last detection
         self._image_size = image_size
         self.mean_score = 0.0
         self._sizes = SizeHistory(settings.size_s)
@@ -439,11 +439,11 @@ class LiveTrack:
         self.detection, self.shared = detection, True
 
     @property
-    def patience_s(self) -> float:
+    def timeout_s(self) -> float:
         """Longest time without a detection before the track ends [s]."""
         if not self.confirmed:
             return self.settings.drop_s
-        longest = AFTER_CUT_S if self.is_doubtful else self.settings.lose_s
+        longest = AFTER_CUT_S if self.after_cut else self.settings.lose_s
         return min(longest, self.seen - self.born)
 
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
@@ -452,7 +452,7 @@ class LiveTrack:
             (u, v), (width, height) = self.center, image_size
             if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
                 return True
-        return self.t - self.seen > self.patience_s
+        return self.t - self.seen > self.timeout_s
 
     def track(self) -> Track:
         """Give the state as a frozen `Track`."""
@@ -515,7 +515,7 @@ class LiveTrack:
             axis.correct(at, var)
         self.seen = self.t
         self.missed = 0
-        self.is_doubtful = False
+        self.after_cut = False
 
 
 def missing(usual: Array, size: Array) -> Array:

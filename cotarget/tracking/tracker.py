@@ -106,7 +106,7 @@ class Tracker:
         The search area grows with the gap, until any detection would match. The time between the last two frames is no
         such gap, even for a track that lives no longer.
         """
-        self._tracks = [state for state in self._tracks if t - state.seen <= state.patience_s + self._interval]
+        self._tracks = [state for state in self._tracks if t - state.seen <= state.timeout_s + self._interval]
         for state in self._tracks:
             state.predict(t)
         if self._t is not None and t > self._t:
@@ -118,7 +118,7 @@ class Tracker:
         by, self._shift = shift - self._shift, shift
         for state in self._tracks:
             state.move(by)
-            state.is_doubtful |= cut
+            state.after_cut |= cut
 
     def _parts(self) -> list[bool]:
         """Whether each track lies mostly in a larger confirmed one."""
@@ -163,7 +163,7 @@ class Tracker:
 
 
 @runtime_checkable
-class Registering(Protocol):
+class RegisteringDetector(Protocol):
     """A detector that measures the camera's motion, and takes the confirmed tracks.
 
     Attributes:
@@ -184,9 +184,9 @@ class Registering(Protocol):
 def update_tracks(tracker: Tracker, detections: Sequence[Measurement], t: float, detector: object) -> list[Track]:
     """Update the tracks with what a detector found at time ``t`` [s]; give all tracks.
 
-    A detector that is `Registering` tells the tracker how the camera has moved, and learns what is followed.
+    A `RegisteringDetector` gives the camera's motion, and takes the confirmed tracks.
     """
-    if not isinstance(detector, Registering):
+    if not isinstance(detector, RegisteringDetector):
         return tracker.update(detections, t)
     tracks = tracker.update(detections, t, detector.shift, cut=detector.cut)
     detector.hold(tracks)

@@ -2,7 +2,7 @@
 
 The mixtures' foreground is grouped with gaps of 3 px, and swept over its threshold and its smallest area; the detector
 is swept over the score from which a track is confirmed. Tracks and labels are matched one to one, from frame 30 on, see
-`cotarget.track_metrics`. Of each way, the best recall with at most so many false tracks a minute counts. The films are
+`cotarget.track_metrics`. Of each way, the best recall at a given rate of false tracks counts. The films are
 the labelled ones of the Drone-detection-dataset, looked for in ../shared/data beside the project, or one's own.
 """
 
@@ -24,7 +24,7 @@ from cotarget.files import read_table
 from cotarget.rig import Frame, Image
 from cotarget.track_metrics import Box, Criterion, Label, Tracked, off_boxes, read_labels, score_tracks
 from cotarget.tracking.track import tracking_settings
-from cotarget.tracking.tracker import Registering, Tracker, update_tracks
+from cotarget.tracking.tracker import RegisteringDetector, Tracker, update_tracks
 from cotarget.video import Film
 from experiments.engine import Count, Row, Settings
 
@@ -161,7 +161,7 @@ def tracks_of(
     tracks: dict[float, list[Tracked]] = {least: [] for least in scores}
     for index, frame in enumerate(frames):
         found = detector.detect(frame)
-        shift, cut = (detector.shift, detector.cut) if isinstance(detector, Registering) else (None, False)
+        shift, cut = (detector.shift, detector.cut) if isinstance(detector, RegisteringDetector) else (None, False)
         update_tracks(own, found, frame.t, detector)
         for least, tracker in trackers.items():
             tracker.update(found, frame.t, shift, cut=cut)
@@ -229,7 +229,7 @@ def curves(rows: Sequence[Row], counted: str = "false_tracks") -> dict[str, list
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Give the best recall of each way with at most so many false tracks a minute; 0 if it always has more.
+    """Give the best recall of each way at each of FALSE_PER_MIN or fewer false tracks; 0 if it always has more.
 
     Both ways: with all false tracks, and without those on flyers that have no label.
     """
