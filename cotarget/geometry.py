@@ -1,4 +1,4 @@
-"""Coordinate frames, rigid transforms and rotation conventions.
+"""Coordinate frames, rigid transforms and rotation conventions; boxes in an image.
 
 Frames (names as in code, the paper's in braces):
 
@@ -22,7 +22,16 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 Array = npt.NDArray[np.float64]
 
-__all__ = ["FARTHEST_M", "Array", "RigidTransform", "Rotation", "angle_between", "pose", "pose_dict"]
+__all__ = [
+    "FARTHEST_M",
+    "Array",
+    "RigidTransform",
+    "Rotation",
+    "angle_between",
+    "intersection_areas",
+    "pose",
+    "pose_dict",
+]
 
 FARTHEST_M, WHOLE_TURN_DEG = 1e6, 360.0  # a configured pose beyond these is a mistake, such as a wrong unit
 
@@ -61,3 +70,21 @@ def angle_between(a: Array, b: Array) -> Array:
         Angles in 0..pi, (...).
     """
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+
+
+def intersection_areas(center: Array, size: Array, others_center: Array, others_size: Array) -> Array:
+    """Compute the areas that boxes share with others.
+
+    Args:
+        center: centres of the boxes (u, v), (n, 2) [px].
+        size: their widths and heights, (n, 2) [px].
+        others_center: centres of the others, (m, 2) [px].
+        others_size: their widths and heights, (m, 2) [px].
+
+    Returns:
+        Areas [px^2], (n, m).
+    """
+    low = np.maximum((center - size / 2)[:, None], others_center - others_size / 2)
+    high = np.minimum((center + size / 2)[:, None], others_center + others_size / 2)
+    sides = np.maximum(high - low, 0.0)
+    return np.asarray(sides[..., 0] * sides[..., 1])

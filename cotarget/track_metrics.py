@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from cotarget.errors import ConfigError
 from cotarget.files import read_table
-from cotarget.geometry import Array
+from cotarget.geometry import Array, intersection_areas
 from cotarget.metrics import BREAK_S, ROUNDING_S, false_tracks
 
 LABELS = ("frame", "x_px", "y_px", "width_px", "height_px")
@@ -84,13 +84,12 @@ class Criterion:
         """Compare every label with every track: at least `iou` where the track is on the label, (labels, tracks)."""
         if not labels or not tracks:
             return np.zeros((len(labels), len(tracks)))
-        at, size = (np.array([getattr(each, name) for each in labels])[:, None] for name in ("center_px", "size_px"))
+        at, size = (np.array([getattr(each, name) for each in labels]) for name in ("center_px", "size_px"))
         center, extent = (np.array([getattr(each, name) for each in tracks]) for name in ("center_px", "size_px"))
-        overlap = np.minimum(at + size / 2, center + extent / 2) - np.maximum(at - size / 2, center - extent / 2)
-        shared = np.maximum(overlap, 0.0).prod(axis=-1)
-        iou = shared / (size.prod(axis=-1) + extent.prod(axis=-1) - shared)
-        side = size.max(axis=-1)
-        near = 1 - (1 - self.iou) * np.linalg.norm(at - center, axis=-1) / side  # `iou` at a distance of one side
+        shared = intersection_areas(at, size, center, extent)
+        iou = shared / (np.add.outer(size.prod(axis=-1), extent.prod(axis=-1)) - shared)
+        side = size.max(axis=-1)[:, None]
+        near = 1 - (1 - self.iou) * np.linalg.norm(at[:, None] - center, axis=-1) / side  # `iou` at one side's distance
         return np.where(np.minimum(side, extent.max(axis=-1)) <= self.small_px, near, iou)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cotarget.geometry import angle_between, pose, pose_dict
+from cotarget.geometry import angle_between, intersection_areas, pose, pose_dict
 
 
 def test_names_chain():
@@ -24,3 +24,10 @@ def test_angle_between_is_exact_at_both_ends(angle):
     assert angle_between(np.array([2.0, 0, 0]), 3 * np.array([np.cos(angle), np.sin(angle), 0])) == pytest.approx(
         angle, abs=1e-15
     )
+
+
+def test_areas_that_boxes_share():
+    """By hand: 4x2 and 2x4 boxes, side by side, across and apart."""
+    center, size = np.array([[0.0, 0.0], [10.0, 0.0]]), np.array([[4.0, 2.0], [4.0, 2.0]])
+    others, sizes = np.array([[1.0, 0.0], [11.5, 1.0], [2.0, 9.0]]), np.array([[2.0, 4.0], [2.0, 2.0], [2.0, 2.0]])
+    np.testing.assert_allclose(intersection_areas(center, size, others, sizes), [[4, 0, 0], [0, 1.5, 0]])

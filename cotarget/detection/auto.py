@@ -21,7 +21,7 @@ import numpy.typing as npt
 from cotarget.detection.background import LARGE, BackgroundDetector
 from cotarget.detection.base import Detection
 from cotarget.detection.small_target import WEIGHTS, SmallTargetDetector, Weights
-from cotarget.geometry import Array
+from cotarget.geometry import Array, intersection_areas
 from cotarget.rig import Frame, Image
 
 if TYPE_CHECKING:
@@ -241,6 +241,5 @@ def _within(found: Sequence[Detection], places: Sequence[tuple[Array, Array]]) -
 
 def _covered(one: Detection, other: Detection) -> float:
     """Part of one detection's box that another covers."""
-    low = np.maximum(one.center_px - one.size_px / 2, other.center_px - other.size_px / 2)
-    high = np.minimum(one.center_px + one.size_px / 2, other.center_px + other.size_px / 2)
-    return float(np.maximum(high - low, 0.0).prod() / one.size_px.prod())
+    shared = intersection_areas(one.center_px[None], one.size_px[None], other.center_px[None], other.size_px[None])
+    return float(shared[0, 0] / one.size_px.prod())

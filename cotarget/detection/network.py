@@ -16,7 +16,7 @@ import numpy.typing as npt
 from cotarget.config import NetworkConfig
 from cotarget.detection.onnx_file import OnnxFile, Outputs
 from cotarget.errors import ConfigError
-from cotarget.geometry import Array
+from cotarget.geometry import Array, intersection_areas
 from cotarget.rig import Image
 
 # Grey level of the letterbox's padding, as YOLO networks are trained.
@@ -152,11 +152,9 @@ class Network:
 
 def _inside(whole: Array, tiled: Array) -> npt.NDArray[np.bool_]:
     """Whether boxes share more than INSIDE of the smaller one, (n, m)."""
-    low = np.maximum(whole[:, None, :2], tiled[None, :, :2])
-    high = np.minimum(whole[:, None, 2:], tiled[None, :, 2:])
-    areas = [(each[:, 2:] - each[:, :2]).prod(axis=1) for each in (whole, tiled)]
-    shared = np.maximum(high - low, 0.0).prod(axis=2)
-    return np.asarray(shared > INSIDE * np.minimum.outer(*areas))
+    (at, size), (center, extent) = (((e[:, :2] + e[:, 2:]) / 2, e[:, 2:] - e[:, :2]) for e in (whole, tiled))
+    shared = intersection_areas(at, size, center, extent)
+    return np.asarray(shared > INSIDE * np.minimum.outer(size.prod(axis=1), extent.prod(axis=1)))
 
 
 def _starts(length: int, side: int) -> list[int]:

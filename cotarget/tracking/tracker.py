@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from cotarget.geometry import Array
+from cotarget.geometry import Array, intersection_areas
 from cotarget.tracking.track import (
     CUT,
     LiveTrack,
@@ -125,7 +125,7 @@ class Tracker:
         at, size = _boxes_of(self._tracks)
         area = _area(size)
         confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
-        inside = _shared(at, NEAR * size, at, size) > PART * area
+        inside = intersection_areas(at, NEAR * size, at, size) > PART * area
         larger = area[:, None] > area
         return np.any(inside & larger & confirmed[:, None], axis=0).tolist()
 
@@ -149,12 +149,12 @@ class Tracker:
         covered = self._settings.covered
         at, size = _boxes_of(self._tracks)
         center, extent = _boxes(detections)
-        shared = _shared(at, size, center, extent)
+        shared = intersection_areas(at, size, center, extent)
         free = np.all(shared <= covered * _area(size)[:, None], axis=0)
         confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
-        near = _shared(at[confirmed], NEAR * size[confirmed], center, extent)
+        near = intersection_areas(at[confirmed], NEAR * size[confirmed], center, extent)
         free &= np.all(near <= PART * _area(extent), axis=0)
-        covers = _shared(center, extent, center, extent) > covered * _area(extent)[:, None]
+        covers = intersection_areas(center, extent, center, extent) > covered * _area(extent)[:, None]
         for j, detection in enumerate(detections):
             if free[j]:  # detections that cover this new track are no further target
                 free &= ~covers[j]
@@ -227,7 +227,7 @@ class _Pairs:
         off = (center - at[:, None]) ** 2 / spread
         self.distance: Array = off[..., 0] + off[..., 1] + resized**2
         self.log_volume: Array = np.log(_area(spread))
-        shared = _shared(at, size, center, extent)
+        shared = intersection_areas(at, size, center, extent)
         self.covered: Array = shared / own
         overlap = shared / (own + other - shared)
         weak = np.array([detection.score < settings.start_score for detection in detections], dtype=bool)
@@ -269,13 +269,6 @@ def _boxes(detections: Sequence[Measurement]) -> tuple[Array, Array]:
     """Centres and sizes of detections [px], (n, 2) each."""
     center, size = [each.center_px for each in detections], [each.size_px for each in detections]
     return np.array(center).reshape(-1, 2), np.array(size).reshape(-1, 2)
-
-
-def _shared(at: Array, size: Array, center: Array, extent: Array) -> Array:
-    """Intersection areas of n boxes with m others [px^2], (n, m); centres and sizes are (n, 2) and (m, 2)."""
-    low = np.maximum((at - size / 2)[:, None], center - extent / 2)
-    high = np.minimum((at + size / 2)[:, None], center + extent / 2)
-    return _area(np.maximum(0.0, high - low))
 
 
 def _area(sides: Array) -> Array:
