@@ -1,8 +1,9 @@
 """The score of small targets on films that it was not fitted to.
 
 The weights of `cotarget.detection.small_target.small_target_score` are fitted to four fifths of the labelled films of
-`experiments.following.films`, and the others are searched with them and with the usual weights. Films that follow each
-other by name are in one fifth, because they often show one place and day, and one kind of flyer.
+`experiments.following.films`. The others are searched with these weights, with those fitted to all films, and with the
+usual ones. Films that follow each other by name are in one fifth, because they often show one place and day, and one
+kind of flyer.
 
 A region that the detector examines in a labelled frame is a target if it is on a label. Logistic regression takes
 targets and others as equally likely in every film.
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FOLDS = 5
-WITHIN = 0.01  # of the recall with the usual weights
-USUAL, OTHERS = "usual weights", "weights of the other films"
+WITHIN = 0.01  # of the recall with weights fitted to all films
+USUAL, ALL, OTHERS = "usual weights", "fitted to all films", "fitted to the other films"
 TARGET = replace(DEFAULT_TARGETS["bird"], detector="auto")
 
 
@@ -51,15 +52,16 @@ def needs(settings: ScoreFoldsSettings) -> str:
 
 
 def one(settings: ScoreFoldsSettings, number: int) -> list[Row]:
-    """Fit the weights without a fifth of the films, and search these; give a row for each film and weights."""
+    """Fit the weights with and without a fifth of the films, and search these; give a row for each film and weights."""
     found = films.films(FilmsSettings(folders=settings.folders))[:: settings.every]
     held_out = np.array_split(np.arange(len(found)), FOLDS)[number]
-    weights = fit([examined(labelled_film(*pair)) for i, pair in enumerate(found) if i not in held_out])
+    regions = [examined(labelled_film(*pair)) for pair in found]
+    others = [each for i, each in enumerate(regions) if i not in held_out]
+    ways = {USUAL: WEIGHTS, ALL: fit(regions), OTHERS: fit(others)}
     rows = []
     for i in held_out.tolist():
         film = labelled_film(*found[i])
-        for name, used in ((USUAL, WEIGHTS), (OTHERS, weights)):
-            rows.append({"seed": number, **_searched(film, name, used)})
+        rows += [{"seed": number, **_searched(film, name, weights)} for name, weights in ways.items()]
     return rows
 
 
@@ -114,7 +116,7 @@ def fit(found: Sequence[tuple[Array, Array]]) -> Weights:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Give recall and false tracks a minute with either weights, over all films, and the range of the weights."""
+    """Give recall and false tracks a minute with each weights, over all films, and the range of the weights."""
     figures = {}
     for way, mine in grouped(rows, "way").items():
         boxes, minutes = (sum(row[name] for row in mine) for name in ("boxes", "minutes"))
@@ -130,17 +132,17 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """State the recall on films that were not fitted, if it is farther off than wanted."""
-    usual, others = (summary[way]["recall"] for way in (USUAL, OTHERS))
-    return [] if abs(usual - others) <= WITHIN else [f"recall {others:.3f} with {OTHERS}, {usual:.3f} with {USUAL}"]
+    fitted, others = (summary[way]["recall"] for way in (ALL, OTHERS))
+    return [] if abs(fitted - others) <= WITHIN else [f"recall {others:.3f} {OTHERS}, {fitted:.3f} {ALL}"]
 
 
 def plot(rows: Sequence[Row], figure: "Figure") -> None:
-    """Recall of each film with the weights of the other films over that with the usual weights."""
+    """Recall of each film with weights fitted to the other films over that with weights fitted to all."""
     axes, found = figure.subplots(), grouped(rows, "way")
-    recalls = [[row["found"] / max(1, row["boxes"]) for row in found[way]] for way in (USUAL, OTHERS)]
+    recalls = [[row["found"] / max(1, row["boxes"]) for row in found[way]] for way in (ALL, OTHERS)]
     axes.plot(*recalls, "o")
     axes.plot([0, 1], [0, 1], "k:")
-    axes.set(xlabel=f"recall, {USUAL}", ylabel=f"recall, {OTHERS}")
+    axes.set(xlabel=f"recall, {ALL}", ylabel=f"recall, {OTHERS}")
 
 
 SETTINGS = ScoreFoldsSettings()
