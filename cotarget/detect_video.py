@@ -14,7 +14,7 @@ import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.detection import make_detector
-from cotarget.drawing import BOX_MARGIN_PX, FULL_HEIGHT_PX, draw_box, enlarged, write_picture, write_text
+from cotarget.drawing import BOX_MARGIN_PX, draw_box, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
@@ -143,26 +143,25 @@ def _row(index: int, t: float, track: Track) -> list[str]:
 
 
 class Trails:
-    """Draw tracks as boxes with their id and their trail, in an image of a small film enlarged."""
+    """Draw tracks as boxes with their id and their trail."""
 
     def __init__(self) -> None:
         self._trails: dict[int, list[tuple[float, Array]]] = {}
 
     def draw(self, image: Image, tracks: Sequence[Track], t: float) -> Image:
         """Draw tracks on a copy of an image; a box is thin while its target is only predicted."""
-        times = max(1, FULL_HEIGHT_PX // image.shape[0])
-        image = enlarged(image, times)
+        image = image.copy()
         self._trails = {
             track.id: [at for at in self._trails.get(track.id, []) if at[0] >= t - TRAIL_S] + [(t, track.center_px)]
             for track in tracks
         }
         for track in tracks:
             colour = COLOURS[track.id % len(COLOURS)]
-            center, size = times * (track.center_px + 0.5) - 0.5, times * track.size_px
-            way = np.array([times * (at + 0.5) - 0.5 for _, at in self._trails[track.id]])
-            way = way[(np.abs(way - center) > size / 2 + BOX_MARGIN_PX).any(axis=1)]  # a small target stays visible
+            way = np.array([center for _, center in self._trails[track.id]])
+            beside = (np.abs(way - track.center_px) > track.size_px / 2 + BOX_MARGIN_PX).any(axis=1)
+            way = way[beside]  # a small target stays visible
             cv2.polylines(image, [np.rint(way).astype(np.int32).reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA)
-            draw_box(image, center, size, colour, str(track.id), bold=track.missed == 0)
+            draw_box(image, track.center_px, track.size_px, colour, str(track.id), bold=track.missed == 0)
         return image
 
 

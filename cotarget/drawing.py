@@ -151,7 +151,7 @@ def captioned(image: Image, text: str) -> Image:
 
 def draw_wide(step: Step, factor: float = 1.0) -> Image:
     """Draw the fixed camera's frame, enlarged by a factor, with boxes of confirmed tracks; the followed one differs."""
-    image = enlarged(step.fixed.image, factor)
+    image = _enlarged(step.fixed.image, factor)
     for track in step.tracks:
         if track.confirmed:
             followed = step.target is not None and track.id == step.target.id
@@ -162,7 +162,7 @@ def draw_wide(step: Step, factor: float = 1.0) -> Image:
     return image
 
 
-def enlarged(image: Image, factor: float) -> Image:
+def _enlarged(image: Image, factor: float) -> Image:
     """Copy an image, enlarged by a factor."""
     if factor == 1:
         return image.copy()
@@ -171,7 +171,7 @@ def enlarged(image: Image, factor: float) -> Image:
 
 def draw_zoom(step: Step, factor: float = 1.0) -> Image:
     """Draw the zoom camera's frame, enlarged by a factor, with a small cross at its centre."""
-    image = enlarged(step.zoom.image, factor)
+    image = _enlarged(step.zoom.image, factor)
     line = max(1, round(_scale_of(image)))
     u, v, near, far = image.shape[1] // 2, image.shape[0] // 2, 4 * line, 12 * line
     for colour, width in ((DARK, 3 * line), (CROSS, line)):

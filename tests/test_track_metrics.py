@@ -23,7 +23,7 @@ from cotarget.track_metrics import (
     read_tracks,
     score_tracks,
 )
-from cotarget.video import Film, FilmWriter
+from cotarget.video import FilmWriter
 from tests.support.recorded_run import RATE_HZ, Bright, calibration_file, record
 
 RATE = 25.0
@@ -287,23 +287,6 @@ def test_the_command_searches_with_the_detector_that_is_given(tmp_path, monkeypa
     assert main(["detect", str(tmp_path / "film.mp4"), *given]) == 0
     assert searched == [used]
     assert read_tracks(tmp_path / "tracks.csv")
-
-
-def test_tracks_in_a_small_film_are_drawn_in_an_enlarged_one(tmp_path):
-    """320x120 px, four times; the box is four times as far, and the target stays visible in it."""
-    write_film(tmp_path / "film.mp4")
-    given = ["--csv", str(tmp_path / "tracks.csv"), "--video", str(tmp_path / "drawn.mp4")]
-    assert main(["detect", str(tmp_path / "film.mp4"), "--target", "bird", *given]) == 0
-    with Film(tmp_path / "drawn.mp4") as film:
-        image = list(film)[60].image
-    assert image.shape == (480, 1280, 3)
-    target = slice(4 * 50, 4 * 60), slice(4 * 200, 4 * 210)
-    assert np.median(image[target]) < 60
-    colour = np.ptp(image.astype(int), axis=2)
-    v, u = np.argwhere(colour > 80).T
-    assert u.max() - u.min() > 40  # box and trail
-    near = np.abs(u - 820) < 40
-    assert abs(np.median(v[near]) - 220) < 40
 
 
 @pytest.fixture
