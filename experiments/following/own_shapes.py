@@ -22,13 +22,12 @@ from cotarget.metrics import WHOLLY_VISIBLE
 from cotarget.rig import Frame, Image
 from cotarget.sim.targets.random_paths import lone_path
 from cotarget.sim.world import SimWorld
-from cotarget.track_metrics import LEARNING_FRAMES, Box, Label, Tracked, score_tracks
+from cotarget.track_metrics import LEARNING_FRAMES, Box, Label, score_tracks
 from cotarget.tracking.track import tracking_settings
-from cotarget.tracking.tracker import Tracker, update_tracks
 from experiments.engine import Count, Row, Settings
 from experiments.following import films
 from experiments.following.field_scenes import field_config
-from experiments.following.films import FilmsSettings, LabelledFilm, labelled_film
+from experiments.following.films import FilmsSettings, LabelledFilm, labelled_film, tracks_of
 from experiments.following.wide_view import WIDE
 from experiments.tables import grouped
 
@@ -145,11 +144,13 @@ def one(settings: OwnShapesSettings, number: int) -> list[Row]:
     film = labelled_film(*_films(settings)[number])
     for name, shape in SHAPES.items():
         target = TargetProfile(shape.length_m, "width", 160.0)
+        least = tracking_settings(target).confirm_score
         for source, (frames, labels, rate_hz) in {
             "simulated": simulated(name, shape, number, settings.frames),
             "composite": composite(film, shape, number, settings.frames),
         }.items():
-            score = score_tracks(_tracks(target, frames, rate_hz), labels, rate_hz, len(frames))
+            tracks = tracks_of(make_detector(target, rate_hz), target, (least,), frames)[least]
+            score = score_tracks(tracks, labels, rate_hz, len(frames))
             if not score.boxes:
                 continue
             rows.append(
@@ -164,17 +165,6 @@ def one(settings: OwnShapesSettings, number: int) -> list[Row]:
                 }
             )
     return rows
-
-
-def _tracks(target: TargetProfile, frames: Sequence[Frame], rate_hz: float) -> list[Tracked]:
-    """Follow what the target's detector finds; give the confirmed tracks of every frame."""
-    detector = make_detector(target, rate_hz)
-    tracker = Tracker(tracking_settings(target), frames[0].image.shape[1::-1])
-    found = []
-    for index, frame in enumerate(frames):
-        tracks = update_tracks(tracker, detector.detect(frame), frame.t, detector)
-        found += [Tracked(e.center_px, e.size_px, index, frame.t, e.id) for e in tracks if e.confirmed]
-    return found
 
 
 Scene = tuple[list[Frame], dict[int, list[Label]], float]  # frames, labels by frame number, frame rate [Hz]

@@ -51,6 +51,11 @@ def needs(settings: ScoreFoldsSettings) -> str:
     return films.needs(FilmsSettings(folders=settings.folders))
 
 
+def jobs(settings: ScoreFoldsSettings) -> Sequence[int]:
+    """Give the fifths' numbers."""
+    return range(min(settings.seeds, FOLDS))
+
+
 def one(settings: ScoreFoldsSettings, number: int) -> list[Row]:
     """Fit the weights with and without a fifth of the films, and search these; give a row for each film and weights."""
     found = films.films(FilmsSettings(folders=settings.folders))[:: settings.every]
