@@ -2,8 +2,8 @@
 
 The mixtures' foreground is grouped with gaps of 3 px, and swept over its threshold and its smallest area; the detector
 is swept over the score from which a track is confirmed. Tracks and labels are matched one to one, from frame 30 on, see
-`cotarget.track_metrics`. Of each way, the best recall at a given rate of false tracks counts. The films are
-the labelled ones of the Drone-detection-dataset, looked for in ../shared/data beside the project, or one's own.
+`cotarget.track_metrics`. Of each way, the best recall at a given rate of false tracks counts. The films are the
+labelled ones of the Drone-detection-dataset, looked for in ../shared/data beside the project, or one's own.
 """
 
 import itertools

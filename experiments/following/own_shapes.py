@@ -1,8 +1,8 @@
 """Targets of any shape, with no setting but their size: a car, a dog and a boat, simulated and drawn into real films.
 
 The simulated ones are MJCF models on the path of a walking person in the field of `experiments.following.field_scenes`.
-The composites are drawings of several colours that cross real films. Both are searched by the default
-detector of a target of one's own. Boxes are exact; tracks and boxes are matched one to one, from frame 30 on, see
+The composites are drawings of several colours that cross real films. Both are searched by the default detector of a
+target of one's own. Boxes are exact; tracks and boxes are matched one to one, from frame 30 on, see
 `cotarget.track_metrics`.
 """
 
@@ -12,22 +12,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.detection import make_detector
 from cotarget.geometry import Array
-from cotarget.metrics import WHOLLY_VISIBLE
 from cotarget.rig import Frame, Image
 from cotarget.sim.targets.random_paths import lone_path
 from cotarget.sim.world import SimWorld
-from cotarget.track_metrics import LEARNING_FRAMES, Box, Label, score_tracks
+from cotarget.track_metrics import Box, Label, score_tracks
 from cotarget.tracking.track import tracking_settings
 from experiments.engine import Count, Row, Settings
 from experiments.following import films
 from experiments.following.field_scenes import field_config
 from experiments.following.films import FilmsSettings, LabelledFilm, labelled_film, tracks_of
+from experiments.following.sim_to_real import Clip, draw_polygons, rendered
 from experiments.following.wide_view import WIDE
 from experiments.tables import grouped
 
@@ -36,9 +35,8 @@ if TYPE_CHECKING:
 
 WANTED = 0.95
 EVERY = 5  # the labelled films that are taken: every fifth
-# Composites: length [px], speed [lengths per second], number of heights of which the farthest from labels is taken, and
-# blur of the lens [px]; they are drawn FINER times as fine.
-SIDE_PX, SPEED, HEIGHTS, BLUR_PX, FINER = (24.0, 120.0), (0.5, 2.0), 50, 0.7, 8
+# Composites: length [px], speed [lengths per second], and number of heights of which the farthest from labels is taken.
+LENGTH_PX, SPEED, HEIGHTS = (24.0, 120.0), (0.5, 2.0), 50
 COME_S = 2.0  # by then the background of the simulated field was learnt, and the target is not yet in view [s]
 
 
@@ -145,14 +143,15 @@ def one(settings: OwnShapesSettings, number: int) -> list[Row]:
     for name, shape in SHAPES.items():
         target = TargetProfile(shape.length_m, "width", 160.0)
         least = tracking_settings(target).confirm_score
-        for source, (frames, labels, rate_hz) in {
+        for source, clip in {
             "simulated": simulated(name, shape, number, settings.frames),
             "composite": composite(film, shape, number, settings.frames),
         }.items():
-            tracks = tracks_of(make_detector(target, rate_hz), target, (least,), frames)[least]
-            score = score_tracks(tracks, labels, rate_hz, len(frames))
+            tracks = tracks_of(make_detector(target, clip.rate_hz), target, (least,), clip.frames)[least]
+            score = score_tracks(tracks, clip.labels, clip.rate_hz, len(clip.frames))
             if not score.boxes:
                 continue
+            sides = [each.larger_side_px for boxes in clip.labels.values() for each in boxes]
             rows.append(
                 {
                     "seed": number,
@@ -161,42 +160,27 @@ def one(settings: OwnShapesSettings, number: int) -> list[Row]:
                     "shape": name,
                     "boxes": score.boxes,
                     "found": score.found,
-                    "side_px": float(np.median([each.larger_side_px for boxes in labels.values() for each in boxes])),
+                    "side_px": float(np.median(sides)),
                 }
             )
     return rows
 
 
-Scene = tuple[list[Frame], dict[int, list[Label]], float]  # frames, labels by frame number, frame rate [Hz]
-
-
-def simulated(name: str, shape: Shape, seed: int, most: int) -> Scene:
+def simulated(name: str, shape: Shape, seed: int, most: int) -> Clip:
     """Render a shape on a person's path; it has a label while it is wholly visible."""
     (path,) = lone_path("person", seed).values()
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, f"{name}.xml")
         model.write_text(f"<mujoco><worldbody><body>{shape.geoms}</body></worldbody></mujoco>")
         config = field_config({name: tuple((t, x, y, shape.height_m / 2) for t, x, y, _ in path)}, seed)
-        sim = replace(config.sim, models={name: model})
-        world = SimWorld(replace(config, sim=sim), rendered=WIDE)
-    truth, frames, labels, rate_hz = world.truth(), list[Frame](), dict[int, list[Label]](), sim.fixed.rate_hz
-    t = COME_S - LEARNING_FRAMES / rate_hz
-    with world.rig as rig:
-        rig.clock.sleep_until(t)
-        for index in range(most):
-            frame = rig.fixed.read(newer_than=t)
-            t = frame.t
-            outline = truth.silhouette(name, "fixed", t)
-            if outline is not None and outline.visible >= WHOLLY_VISIBLE:
-                labels[index] = [Label((outline.low_px + outline.high_px) / 2, outline.size_px)]
-            frames.append(frame)
-    return frames, labels, rate_hz
+        world = SimWorld(replace(config, sim=replace(config.sim, models={name: model})), rendered=WIDE)
+    return rendered(world, COME_S, most)
 
 
-def composite(film: LabelledFilm, shape: Shape, seed: int, most: int) -> Scene:
+def composite(film: LabelledFilm, shape: Shape, seed: int, most: int) -> Clip:
     """Draw a shape that crosses a film at a height far from its labels; it has a label while it is whole."""
     rng = np.random.default_rng(seed)
-    side, speed = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in (SIDE_PX, SPEED))
+    side, speed = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in (LENGTH_PX, SPEED))
     frames, way = film.frames[:most], rng.choice([-1, 1])
     width, height = frames[0].image.shape[1::-1]
     taken = np.array([label.center_px[1] for boxes in film.labels.values() for label in boxes])
@@ -209,7 +193,7 @@ def composite(film: LabelledFilm, shape: Shape, seed: int, most: int) -> Scene:
         low, high = box.center_px - box.size_px / 2, box.center_px + box.size_px / 2
         if low[0] >= -0.5 and high[0] <= width - 0.5:
             labels[index] = [Label(box.center_px, box.size_px)]
-    return made, labels, film.rate_hz
+    return Clip(made, labels, film.rate_hz)
 
 
 def draw_shape(image: Image, shape: Shape, center_px: Array, length_px: float) -> Box:
@@ -224,26 +208,8 @@ def draw_shape(image: Image, shape: Shape, center_px: Array, length_px: float) -
     Returns:
         Exact box before the lens blurs it.
     """
-    parts = [(center_px + np.array(polygon) * (length_px, abs(length_px)), colour) for polygon, colour in shape.drawn]
-    corners = np.vstack([polygon for polygon, _ in parts])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    box = Box((low + high) / 2, high - low)
-    margin, limit = np.ceil(3 * BLUR_PX), np.array(image.shape[1::-1])
-    (left, top), (right, bottom) = (
-        np.clip(np.rint(edge), 0, limit).astype(int) for edge in (low - margin, high + margin + 1)
-    )
-    size = right - left, bottom - top
-    if not all(size):
-        return box  # outside the image
-    # The last channel is how much of a pixel is covered.
-    fine = np.zeros((size[1] * FINER, size[0] * FINER, 4), dtype=np.float32)
-    for polygon, colour in parts:
-        pixels = np.rint((polygon - (left, top) + 0.5) * FINER - 0.5).astype(np.int32)
-        cv2.fillPoly(fine, [pixels], (*colour, 1.0))
-    blurred = cv2.resize(cv2.GaussianBlur(fine, None, BLUR_PX * FINER), size, interpolation=cv2.INTER_AREA)
-    drawn, covered = blurred[..., :3], blurred[..., 3:]
-    image[top:bottom, left:right] = np.rint((1 - covered) * image[top:bottom, left:right] + drawn).clip(0, 255)
-    return box
+    scale = length_px, abs(length_px)
+    return draw_polygons(image, [(center_px + np.array(polygon) * scale, colour) for polygon, colour in shape.drawn])
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:

@@ -335,30 +335,51 @@ def draw_flyer(image: Image, center_px: Array, side_px: float, beat_rad: float, 
     body = side_px * np.column_stack([0.2 * np.cos(turn), 0.15 * np.sin(turn)])
     tip = side_px / 2 * np.array([np.cos(beat_rad), -np.sin(beat_rad)])
     wings = [np.array([[0, -0.15 * side_px], tip * (way, 1), [0, 0.15 * side_px]]) for way in (-1, 1)]
-    low, high = (limit(np.vstack([body, *wings]), axis=0) for limit in (np.min, np.max))
-    box = Box(center_px + (low + high) / 2, high - low)
+    return draw_polygons(image, [(center_px + part, colour) for part in (body, *wings)])
+
+
+def draw_polygons(image: Image, parts: Sequence[tuple[Array, Sequence[float] | Array]]) -> Box:
+    """Draw polygons into an image, the later ones over the others, seen through a lens.
+
+    Args:
+        image: changed in place, (H, W, 3).
+        parts: corners (u, v), (n, 2) [px], and colour, (3,) [grey levels], of each.
+
+    Returns:
+        Exact box before the lens blurs it.
+    """
+    low, high = (limit(np.vstack([corners for corners, _ in parts]), axis=0) for limit in (np.min, np.max))
+    box = Box((low + high) / 2, high - low)
     rows, columns = _pixels(box, np.ceil(3 * BLUR_PX), image.shape)
-    cover = np.zeros(((rows.stop - rows.start) * FINER, (columns.stop - columns.start) * FINER), dtype=np.float32)
-    corner = np.array([columns.start, rows.start]) - 0.5
-    for part in (body, *wings):
-        cv2.fillPoly(cover, [np.rint((part + center_px - corner) * FINER - 0.5).astype(np.int32)], 1.0)
-    cover = np.asarray(cv2.GaussianBlur(cover, None, BLUR_PX * FINER), dtype=np.float32)
     size = columns.stop - columns.start, rows.stop - rows.start
-    opaque = np.asarray(cv2.resize(cover, size, interpolation=cv2.INTER_AREA))[..., None]
-    image[rows, columns] = np.rint((1 - opaque) * image[rows, columns] + opaque * colour)
+    fine = np.zeros((size[1] * FINER, size[0] * FINER, 4), dtype=np.float32)  # the last channel is what is covered
+    corner = np.array([columns.start, rows.start]) - 0.5
+    for corners, colour in parts:
+        cv2.fillPoly(fine, [np.rint((corners - corner) * FINER - 0.5).astype(np.int32)], (*colour, 1.0))
+    seen = cv2.resize(cv2.GaussianBlur(fine, None, BLUR_PX * FINER), size, interpolation=cv2.INTER_AREA)
+    image[rows, columns] = np.rint((1 - seen[..., 3:]) * image[rows, columns] + seen[..., :3])
     return box
 
 
 def _simulation(settings: SimToRealSettings, number: int) -> Clip:
-    """Render five birds in the field, from when the first comes; one that is not wholly visible has no label."""
-    config = five_targets_config(number, "bird")
-    world = SimWorld(config, rendered=WIDE)
+    """Render five birds in the field, from when the first comes."""
+    return rendered(SimWorld(five_targets_config(number, "bird"), rendered=WIDE), COME_S, settings.frames)
+
+
+def rendered(world: SimWorld, come_s: float, most: int) -> Clip:
+    """Render the fixed camera's frames; a target that is not wholly visible has no label.
+
+    Args:
+        world: world whose fixed camera is rendered.
+        come_s: when the first target comes; the background is learnt before [s].
+        most: number of frames.
+    """
     truth, frames, labels = world.truth(), list[Frame](), Labels()
-    rate_hz = config.sim.fixed.rate_hz
-    t = COME_S - LEARNING_FRAMES / rate_hz
+    rate_hz = world.config.sim.fixed.rate_hz
+    t = come_s - LEARNING_FRAMES / rate_hz
     with world.rig as rig:
         rig.clock.sleep_until(t)
-        for index in range(settings.frames):
+        for index in range(most):
             frame = rig.fixed.read(newer_than=t)
             t = frame.t
             outlines = [truth.silhouette(name, "fixed", frame.t) for name in truth.targets]

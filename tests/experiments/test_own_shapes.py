@@ -28,8 +28,9 @@ def test_a_drawing_is_where_its_box_says_and_looks_ahead(name, length):
 def test_a_composite_crosses_its_film_far_from_labels():
     frames = [Frame(np.full((240, 320, 3), 128, np.uint8), i / 25) for i in range(250)]
     taken = {i: [Label(np.array([160.0, 60.0]), np.array([10.0, 10.0]))] for i in range(250)}
-    made, labels, rate = composite(LabelledFilm("wall", frames, 25.0, taken, {}), SHAPES["car"], 3, 240)
-    assert (len(made), rate) == (240, 25.0)
+    clip = composite(LabelledFilm("wall", frames, 25.0, taken, {}), SHAPES["car"], 3, 240)
+    made, labels = clip.frames, clip.labels
+    assert (len(made), clip.rate_hz) == (240, 25.0)
     assert min(labels) > 0  # it comes in
     for i, (label,) in labels.items():
         low, high = label.center_px - label.size_px / 2, label.center_px + label.size_px / 2
