@@ -37,8 +37,8 @@ LEAST_CORNER = 3e-4
 CORNER_BLOCK = 3
 # With fewer corners the median is no measurement, and the camera is taken to stand still.
 FEWEST = 8
-# The same if the standard deviation of their places is less than this part of the image's side, along both axes: they
-# are on a target before a plain background. Places all over half an image have 0.144.
+# Least standard deviation of the corners' places along one axis, over the image's side. Corners nearer together are on a
+# target before a plain background, and the camera is taken to stand still. All over half an image they have 0.144.
 SPREAD = 0.144
 # Fewest corners, where there were too few before, that show another scene.
 MANY = 24
@@ -49,7 +49,7 @@ FOUND_AGAIN, FEWEST_ALIKE = 0.3, 0.35
 RENEW_FRAMES = 15
 # Window in which a corner is tracked, and pyramid levels: up to 20 px a frame of the full image.
 WINDOW_PX, LEVELS = (11, 11), 2
-# Corners have one shift if theirs differ from it by at most this [px].
+# Largest difference of a corner's shift from the common one, along each axis [px].
 AGREEMENT_PX = 2.0
 
 
