@@ -37,8 +37,8 @@ LEAST_CORNER = 3e-4
 CORNER_BLOCK = 3
 # With fewer corners the median is no measurement, and the camera is taken to stand still.
 FEWEST = 8
-# Least standard deviation of the corners' places along one axis, over the image's side. Corners nearer together are on a
-# target before a plain background, and the camera is taken to stand still. All over half an image they have 0.144.
+# Least standard deviation of the corners' places along one axis, over the image's side. Corners nearer together are on
+# a target before a plain background, and the camera is taken to stand still. All over half an image they have 0.144.
 SPREAD = 0.144
 # Fewest corners, where there were too few before, that show another scene.
 MANY = 24
