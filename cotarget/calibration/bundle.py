@@ -174,14 +174,13 @@ def _all_moved(boards: Mapping[int, RigidTransform], steps: Array) -> dict[int, 
     M = np.stack([T.as_matrix() for T in boards.values()])
     M[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ M[:, :3, :3]
     M[:, :3, 3] += steps[:, 3:]
-    moved = RigidTransform.from_matrix(M)
+    moved = RigidTransform.from_matrix(M)  # orthonormal again
     return {number: moved[i] for i, number in enumerate(boards)}
 
 
 def _moved(T: RigidTransform, step: Array | None) -> RigidTransform:
-    if step is None:
-        return T
-    return RigidTransform.from_components(T.translation + step[3:], Rotation.from_rotvec(step[:3]) * T.rotation)
+    """Apply a pose step (6,), if there is one."""
+    return T if step is None else _all_moved({0: T}, step[None])[0]
 
 
 def _numbers(lens: Intrinsics) -> Array:
@@ -296,9 +295,9 @@ def _points_in_camera(model: BundleModel, batch: Batch, points: Array) -> tuple[
     d_warp = M[:, None, :3, 2:3] * bulge[:, None]  # dy/dwarp, (v, N, 3, 2)
     if batch.stop is None:
         return y, {"board": d_board, "warp": d_warp}
-    head, T = model.head, model.head.hand_eye()
-    R_g, R_h = head.T_zoom0_fixed.rotation.as_matrix(), T.rotation.as_matrix()
-    t_h = T.translation
+    head, hand = model.head, model.head.hand_eye()
+    R_g, R_h = (T.as_matrix()[:3, :3] for T in (head.T_zoom0_fixed, hand))
+    t_h = hand.translation
     R_p, t_p, A = base_heads(head.axes, batch.pan, batch.tilt)
     turned_g = y @ R_g.T
     w = turned_g + head.T_zoom0_fixed.translation  # x_zoom0
@@ -367,9 +366,12 @@ def _by_turn(head: HeadGeometry, A: Array, x_head: Array) -> Array:
 def _pose_derivative(turned: Array) -> Array:
     """Compute the derivative of R x + t by a step (w, d), given R x: [-[R x]x, I], (..., 3, 6)."""
     x, y, z = np.moveaxis(turned, -1, 0)
-    o, i = np.zeros_like(x), np.ones_like(x)
-    rows = [[o, z, -y, i, o, o], [-z, o, x, o, i, o], [y, -x, o, o, o, i]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    d = np.zeros((*turned.shape, POSE_PARAMETERS))
+    d[..., 0, 1], d[..., 0, 2] = z, -y
+    d[..., 1, 0], d[..., 1, 2] = -z, x
+    d[..., 2, 0], d[..., 2, 1] = y, -x
+    d[..., 3:] = np.eye(3)
+    return d
 
 
 def _project(lens: Intrinsics, x_camera: Array) -> tuple[Array, Array, Array, Array]:
@@ -537,11 +539,18 @@ class Problem:
         return Equations(shared, mixed, board, shared_gradient, board_gradient, squares)
 
     def _known(self, model: BundleModel, variance: float) -> tuple[Array, Array]:
-        """Compute the free parameters' deviations from the prior's means, (n,), and their weights [px^2], (n,)."""
+        """Compute the free parameters' deviations from the prior's means, (n,), and their weights [px^2], (n,).
+
+        Blocks without a prior, whose weights are 0, are left at 0.
+        """
         assert self.prior is not None
         names = parameter_names(self.free, model.stops)
         sigmas = np.array([self.prior.sigmas.get(name, np.inf) for name in names])
-        return difference(model, self.prior.reference, self.free), variance / sigmas**2
+        off, columns = np.zeros(len(names)), columns_of(self.free, model.stops)
+        for block in self.free:
+            if np.isfinite(sigmas[columns[block]]).any():
+                off[columns[block]] = difference(model, self.prior.reference, (block,))
+        return off, variance / sigmas**2
 
     def _seen(self, residuals: list[Array]) -> Array:
         """Select the residuals of the corners that are seen, (n, 2)."""
