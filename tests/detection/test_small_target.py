@@ -282,6 +282,38 @@ def test_the_cameras_shift_is_measured():
     assert np.linalg.norm(shift - total) < 0.1 * np.sqrt(40)
 
 
+def test_writing_in_the_corners_of_a_shaken_image_does_not_stand_for_the_scene():
+    """It extends over more of the image than the scene, but has few corners."""
+    rng = np.random.default_rng(14)
+    scene = cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT, WIDTH, 3)), (0, 0), 2.0)
+    scene = 110 + 30 * scene / scene.std()
+    writing = rng.choice([20.0, 230.0], (8, 24, 1)).repeat(2, axis=0).repeat(2, axis=1)
+    camera = CameraMotion()
+    for i in range(20):
+        at = np.array([0.0, 0.0]) if i % 2 else np.array([2.6, -2.3])
+        picture = cv2.warpAffine(
+            scene, np.column_stack([np.eye(2), at]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
+        )
+        for rows in (slice(None, 16), slice(-16, None)):
+            for columns in (slice(None, 48), slice(-48, None)):
+                picture[rows, columns] = writing
+        shift = camera.update(cv2.cvtColor(photograph(picture, rng), cv2.COLOR_BGR2GRAY))
+        assert not camera.jumped
+        assert np.abs(shift - (at - [2.6, -2.3])).max() < 0.5
+
+
+def test_clouds_that_drift_do_not_move_the_scene():
+    rng = np.random.default_rng(15)
+    scene = cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT, WIDTH, 3)), (0, 0), 2.0)
+    scene = 110 + 30 * scene / scene.std()
+    clouds, camera = scene[: HEIGHT // 3, ::-1].copy(), CameraMotion()
+    for i in range(100):
+        M = np.column_stack([np.eye(2), [-0.25 * i, 0.0]])
+        scene[: HEIGHT // 3] = cv2.warpAffine(clouds, M, (WIDTH, HEIGHT // 3), borderMode=cv2.BORDER_WRAP)
+        shift = camera.update(cv2.cvtColor(photograph(scene, rng), cv2.COLOR_BGR2GRAY))
+        assert np.abs(shift).max() < 0.5
+
+
 def test_a_cut_is_noticed_and_a_sky_without_corners_stands():
     rng = np.random.default_rng(5)
     camera = CameraMotion()
