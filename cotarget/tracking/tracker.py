@@ -28,6 +28,10 @@ __all__ = ["Measurement", "Track", "Tracker", "TrackingSettings", "tracking_sett
 IMPOSSIBLE = 1e6
 # What lies to this part in a confirmed track's box, enlarged by a factor, belongs to it: a shoe, a rotor.
 PART, NEAR = 0.5, 1.5
+# An older track in the box of one whose area is larger by this factor is a part of it, such as the hand of a person who
+# comes into view, once both have moved by the part's larger side and at most this part of the way apart. A bird before
+# a cloud does not move with it.
+PART_AREA, APART = 4.0, 0.5
 
 
 class Tracker:
@@ -46,6 +50,8 @@ class Tracker:
         self._image_size = image_size
         self._tracks: list[LiveTrack] = []
         self._next_id = 1
+        # Centres of a larger and a smaller track, by their numbers, when the one came into the other's box [px].
+        self._joint: dict[tuple[int, int], tuple[Array, Array]] = {}
         self._t: float | None = None
         self._shift: Array = np.zeros(2)  # of the scene in the last frame [px]
         self._interval = self._settings.lose_s  # between the last two frames [s]
@@ -96,6 +102,7 @@ class Tracker:
             else:
                 state.missed += 1
         self._tracks = [s for s in self._tracks if not s.is_over(self._image_size)]
+        self._join_parts()
         least = self._settings.start_score
         self._start_tracks([each for j, each in enumerate(detections) if j not in taken and each.score >= least], t)
         return self.tracks
@@ -128,6 +135,28 @@ class Tracker:
         inside = intersection_areas(at, NEAR * size, at, size) > PART * area
         larger = area[:, None] > area
         return np.any(inside & larger & confirmed[:, None], axis=0).tolist()
+
+    def _join_parts(self) -> None:
+        """End each older part of a track that has moved with it; the whole takes its number."""
+        confirmed = [state for state in self._tracks if state.confirmed]
+        at, size = _boxes_of(confirmed)
+        area = _area(size)
+        inside = intersection_areas(at, size, at, size) > PART * area
+        inside &= area[:, None] > PART_AREA * area
+        wholes: dict[tuple[int, int], tuple[Array, Array]] = {}
+        for i, j in np.argwhere(inside).tolist():
+            whole, part = confirmed[i], confirmed[j]
+            if part.number > whole.number:
+                continue
+            then = self._joint.get((whole.number, part.number), (at[i], at[j]))
+            way, apart = at[i] - then[0], at[i] - then[0] - at[j] + then[1]
+            moved = float(np.hypot(*way))
+            if moved > size[j].max() and np.hypot(*apart) < APART * moved:
+                whole.number = part.number
+                self._tracks.remove(part)
+            else:
+                wholes[whole.number, part.number] = then
+        self._joint = wholes
 
     def _most_useful(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
         """Select at most `most_detections` detections, in their order."""

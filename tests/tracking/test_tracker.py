@@ -245,6 +245,29 @@ def test_two_targets_merged_into_one_box_both_live_on():
     assert [np.sign(t.velocity_px[0]) for t in tracks] == [1, -1]
 
 
+def test_a_hand_that_comes_into_view_first_becomes_the_person():
+    """Hand and person are confirmed beside each other, before the person is seen as a whole; both move alike."""
+    tracker = Tracker(PLAIN, SIZE)
+    for i in range(30):
+        hand = 600 - 4 * i
+        left = hand + 8 if i < 10 else hand - 20
+        tracks = tracker.update(
+            [seen(hand, 300, 10, 10), seen((left + hand + 60) / 2, 300, hand + 60 - left, 140)], i / RATE
+        )
+        if i == 9:
+            assert [track.id for track in tracks] == [1, 2]
+    assert [(track.id, track.size_px.tolist()) for track in tracks] == [(1, [80, 140])]
+
+
+@pytest.mark.parametrize("speed", [0.0, -60.0], ids=["hovers", "flies past"])
+def test_a_bird_before_a_cloud_is_no_part_of_it(speed):
+    tracker, times = Tracker(PLAIN, SIZE), np.arange(100) / RATE
+    for t in times:
+        tracks = tracker.update([seen(400 + speed * t, 200, 12, 6), seen(200 + 60 * t, 200, 150, 80)], t)
+        assert not t or [track.size_px[0] for track in tracks] == [12.0, 150.0]
+    assert [track.id for track in tracks] == [1, 2]
+
+
 def test_shared_detection_is_marked_as_such():
     tracker = Tracker(PLAIN)
     for i in range(20):
