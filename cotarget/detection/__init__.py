@@ -58,7 +58,7 @@ def make_detector(target: TargetProfile, rate_hz: float, template: Image | None 
     if kind == "onnx":
         return ExternalDetector(make_network(target))
     if kind == "auto":
-        return AutoDetector(rate_hz)
+        return AutoDetector(rate_hz, shape=target.shape)
     if kind == "speck":
         return SmallTargetDetector()
     if kind in ("motion", "mog2"):

@@ -9,6 +9,7 @@ background is not learnt where the tracker follows a target, so a target that st
 docs/design-notes.md.
 """
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
@@ -51,6 +52,9 @@ INSIDE = 0.5
 HELD_S = 60.0
 # Margin around what is held: in parts of its size, and in parts of the image's width.
 HELD_MARGIN, HELD_PART = 0.2, 2 / 640
+# Logarithm of width over height: standard deviation of targets about the expected one, as persons who walk have, and of
+# anything about a square; and part of the targets that may have any shape, such as two persons side by side.
+SHAPE_SIGMA, OTHER_SIGMA, OTHER_PART = 0.5, 1.0, 0.05
 # Clutter: number of cells along the image's width, memory [s], and the usual score that halves a target's odds.
 CELLS, CLUTTER_S, CLUTTER_EVEN = 80, 10.0, 0.03
 # Largest weight of one image in the clutter map: the first after a pause does not empty it.
@@ -60,13 +64,15 @@ MOST_GAIN = 0.1
 class AutoDetector:
     """Detect small targets by contrast and change, and large ones by a background model."""
 
-    def __init__(self, rate_hz: float, weights: Weights = WEIGHTS) -> None:
+    def __init__(self, rate_hz: float, weights: Weights = WEIGHTS, shape: float | None = None) -> None:
         """Start without history and background.
 
         Args:
             rate_hz: nominal frame rate [Hz].
             weights: of the score of small targets, see `cotarget.detection.small_target.small_target_score`.
+            shape: expected width over height of the target's box; None if it is unknown.
         """
+        self._shape = shape
         self._small = SmallTargetDetector(LEAST_SCORE, weights)
         self._large = BackgroundDetector(LARGE, rate_hz)
         self._clutter = Clutter()
@@ -107,16 +113,18 @@ class AutoDetector:
         if not self._small.repeated:  # a repeated frame shows no target, and says nothing of where they usually are
             small = self._clutter.weigh(small, frame.t, width, self._held)
         if not self._steady:
-            return sorted(small, key=lambda each: -each.score)
+            return self._by_shape(small)
         self._large.held = self._held
         large = [replace(each, score=LARGE_SCORE) for each in self._large.detect(frame)]
         outlined = [target.beside <= PLAIN for target, _ in targets]
-        return fuse(
-            small,
-            outlined,
-            self._are_followed(small),
-            [each for each in large if each.size_px.max() >= LARGE_PART * width],
-        )
+        large = [each for each in large if each.size_px.max() >= LARGE_PART * width]
+        return self._by_shape(fuse(small, outlined, self._are_followed(small), large))
+
+    def _by_shape(self, found: Sequence[Detection]) -> list[Detection]:
+        """Weigh the scores by the expected shape, if there is one, but not those of clipped boxes; best first."""
+        if self._shape is not None:
+            found = [each if each.clipped else replace(each, score=by_shape(each, self._shape)) for each in found]
+        return sorted(found, key=lambda each: -each.score)
 
     def _register(self, t: float, width: int) -> bool:
         """Give the background model the camera's shift; whether the camera has stood still for STEADY_S."""
@@ -230,6 +238,24 @@ def fuse(
         found = [each for each in found if not any(each is part for part in parts)]
         found.append(replace(whole, score=max([whole.score, *(part.score for part in parts)])))
     return sorted(found, key=lambda each: -each.score)
+
+
+def by_shape(found: Detection, shape: float) -> float:
+    """Score of a detection whose odds are multiplied by the likelihood ratio of its shape, if that is less than 1.
+
+    Args:
+        found: the detection.
+        shape: expected width over height of a target's box.
+    """
+    observed = math.log(found.size_px[0] / found.size_px[1])
+    of_target = _normal(observed - math.log(shape), SHAPE_SIGMA) / _normal(observed, OTHER_SIGMA)
+    ratio = min(1.0, OTHER_PART + (1 - OTHER_PART) * of_target)
+    return ratio * found.score / (ratio * found.score + 1 - found.score)
+
+
+def _normal(off: float, sigma: float) -> float:
+    """Density of a normal distribution, but for a factor."""
+    return math.exp(-((off / sigma) ** 2) / 2) / sigma
 
 
 def _within(found: Sequence[Detection], places: Sequence[tuple[Array, Array]]) -> npt.NDArray[np.bool_]:

@@ -6,7 +6,7 @@ import pytest
 
 from cotarget.config import TargetProfile
 from cotarget.detection import AutoDetector, BackgroundDetector, Detection, make_detector
-from cotarget.detection.auto import Clutter, fuse
+from cotarget.detection.auto import Clutter, by_shape, fuse
 from cotarget.detection.background import LARGE
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
@@ -289,3 +289,14 @@ def test_a_place_that_is_held_may_lie_outside_the_image():
     picture = scenery((640, 480), rng)
     for i in range(20):
         assert detector.detect(Frame(picture.astype(np.uint8), i / rate)) == []
+
+
+@pytest.mark.parametrize(("size", "score"), [
+    ((40, 100), 0.5),  # the expected shape
+    ((70, 100), 0.5),  # a stride, or two persons side by side
+    ((100, 100), 0.288),  # N(ln 2.5; 0.5) / N(0; 1) = 0.373; 95 % of it and 5 % are odds of 0.404
+    ((300, 100), 0.049),  # a person lies in one of twenty cases
+], ids=["usual", "wide", "square", "lying"])  # fmt: skip
+def test_an_unusual_shape_makes_a_target_less_likely(size, score):
+    found = Detection(np.array([100.0, 100.0]), np.array(size, dtype=float), 0.5)
+    assert by_shape(found, 0.4) == pytest.approx(score, abs=0.001)
