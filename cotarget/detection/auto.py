@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.detection.background import LARGE, BackgroundDetector
+from cotarget.detection.background import LARGE, PERSON, BackgroundDetector
 from cotarget.detection.base import Detection
 from cotarget.detection.small_target import WEIGHTS, SmallTargetDetector, Weights
 from cotarget.geometry import Array, intersection_areas
@@ -74,7 +74,8 @@ class AutoDetector:
         """
         self._shape = shape
         self._small = SmallTargetDetector(LEAST_SCORE, weights)
-        self._large = BackgroundDetector(LARGE, rate_hz)
+        upright = shape is not None and shape < 1
+        self._large = BackgroundDetector(replace(LARGE, flat=PERSON.flat) if upright else LARGE, rate_hz)
         self._clutter = Clutter()
         self._width = 0
         self._steady = False  # whether large targets were searched in the last image

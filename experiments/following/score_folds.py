@@ -9,8 +9,10 @@ A region that the detector examines in a labelled frame is a target if it is on 
 targets and others as equally likely in every film.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,9 +60,8 @@ def jobs(settings: ScoreFoldsSettings) -> Sequence[int]:
 
 def one(settings: ScoreFoldsSettings, number: int) -> list[Row]:
     """Fit the weights with and without a fifth of the films, and search these; give a row for each film and weights."""
-    found = films.films(FilmsSettings(folders=settings.folders))[:: settings.every]
+    found, regions = _films_and_regions(settings)
     held_out = np.array_split(np.arange(len(found)), FOLDS)[number]
-    regions = [examined(labelled_film(*pair)) for pair in found]
     others = [each for i, each in enumerate(regions) if i not in held_out]
     ways = {USUAL: WEIGHTS, ALL: fit(regions), OTHERS: fit(others)}
     rows = []
@@ -68,6 +69,13 @@ def one(settings: ScoreFoldsSettings, number: int) -> list[Row]:
         film = labelled_film(*found[i])
         rows += [{"seed": number, **_searched(film, name, weights)} for name, weights in ways.items()]
     return rows
+
+
+@functools.cache
+def _films_and_regions(settings: ScoreFoldsSettings) -> tuple[list[tuple[Path, Path]], list[tuple[Array, Array]]]:
+    """Give the films, and the regions examined in each; they are the same for every fifth."""
+    found = films.films(FilmsSettings(folders=settings.folders))[:: settings.every]
+    return found, [examined(labelled_film(*pair)) for pair in found]
 
 
 def _searched(film: LabelledFilm, name: str, weights: Weights) -> Row:

@@ -300,3 +300,22 @@ def test_a_place_that_is_held_may_lie_outside_the_image():
 def test_an_unusual_shape_makes_a_target_less_likely(size, score):
     found = Detection(np.array([100.0, 100.0]), np.array(size, dtype=float), 0.5)
     assert by_shape(found, 0.4) == pytest.approx(score, abs=0.001)
+
+
+@pytest.mark.parametrize(("shape", "width"), [(0.4, (25, 42)), (None, (60, 130))])
+def test_an_upright_target_is_boxed_without_the_dark_shadow_at_its_feet(shape, width):
+    rng, rate = np.random.default_rng(22), 25.0
+    background, surface = scenery((640, 480), rng), texture(32, 90, rng)
+    detector = make_detector(TargetProfile(1.75, "height", 300.0, shape=shape), rate)
+
+    def pictures():
+        for i in range(60):
+            picture = background.copy()
+            if i >= 15:
+                u = 60 + 5 * (i - 15)
+                picture[382:390, u + 30 : u + 100] *= 0.3
+                picture[300:390, u : u + 32] = surface
+            yield picture
+
+    highest = max(follow(pictures(), rate, rng, detector)[-1], key=lambda track: float(track.size_px[1]))
+    assert width[0] < highest.size_px[0] < width[1]
