@@ -50,8 +50,8 @@ class Tracker:
         self._image_size = image_size
         self._tracks: list[LiveTrack] = []
         self._next_id = 1
-        # Centres of a larger and a smaller track, by their numbers, when the one came into the other's box [px].
-        self._joint: dict[tuple[int, int], tuple[Array, Array]] = {}
+        # Centres of a larger and an older smaller track, by their numbers, since when this is in that one's box [px].
+        self._together: dict[tuple[int, int], tuple[Array, Array]] = {}
         self._t: float | None = None
         self._shift: Array = np.zeros(2)  # of the scene in the last frame [px]
         self._interval = self._settings.lose_s  # between the last two frames [s]
@@ -143,20 +143,21 @@ class Tracker:
         area = _area(size)
         inside = intersection_areas(at, size, at, size) > PART * area
         inside &= area[:, None] > PART_AREA * area
-        wholes: dict[tuple[int, int], tuple[Array, Array]] = {}
+        at = at - self._shift  # in the scene, since a camera that turns moves all tracks alike
+        together: dict[tuple[int, int], tuple[Array, Array]] = {}
         for i, j in np.argwhere(inside).tolist():
             whole, part = confirmed[i], confirmed[j]
-            if part.number > whole.number:
+            if part.number >= whole.number or part not in self._tracks:
                 continue
-            then = self._joint.get((whole.number, part.number), (at[i], at[j]))
-            way, apart = at[i] - then[0], at[i] - then[0] - at[j] + then[1]
-            moved = float(np.hypot(*way))
-            if moved > size[j].max() and np.hypot(*apart) < APART * moved:
+            then = self._together.get((whole.number, part.number), (at[i], at[j]))
+            way = at[i] - then[0]
+            moved, apart = float(np.hypot(*way)), float(np.hypot(*(way - (at[j] - then[1]))))
+            if moved > size[j].max() and apart < APART * moved:
                 whole.number = part.number
                 self._tracks.remove(part)
             else:
-                wholes[whole.number, part.number] = then
-        self._joint = wholes
+                together[whole.number, part.number] = then
+        self._together = together
 
     def _most_useful(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
         """Select at most `most_detections` detections, in their order."""

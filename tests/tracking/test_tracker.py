@@ -268,6 +268,30 @@ def test_a_bird_before_a_cloud_is_no_part_of_it(speed):
     assert [track.id for track in tracks] == [1, 2]
 
 
+def test_a_part_of_two_targets_becomes_one_of_them():
+    """A small one between two large ones, which come closer together and move alike."""
+    tracker = Tracker(PLAIN, SIZE)
+    for i in range(40):
+        u = 500 - 4 * i
+        beside = 78 - 2 * min(max(0, i - 10), 6)
+        boxes = [seen(u, 240, 10, 10), *(seen(u, 240 + side * beside, 60, 140) for side in (-1, 1))]
+        tracks = tracker.update(boxes if i < 20 or i % 2 else boxes[1:], i / RATE)
+        if i == 9:
+            assert [track.id for track in tracks] == [1, 2, 3]
+    assert [track.size_px.tolist() for track in tracks] == [[60, 140]] * 2
+    assert len({track.id for track in tracks} - {2, 3}) == 1
+
+
+def test_a_camera_that_turns_does_not_make_a_bird_part_of_the_cloud_behind_it():
+    """The cloud drifts behind the bird and stops; then the camera turns, and both move alike in the image."""
+    tracker = Tracker(PLAIN, SIZE)
+    for i in range(75):
+        shift = np.array([-4.0 * max(0, i - 25), 0.0])
+        bird, cloud = seen(450 + shift[0], 200, 12, 6), seen(300 + 4 * min(i, 25) + shift[0], 200, 150, 80)
+        tracks = tracker.update([bird, cloud], i / RATE, shift)
+    assert [track.size_px[0] for track in tracks] == [12.0, 150.0]
+
+
 def test_shared_detection_is_marked_as_such():
     tracker = Tracker(PLAIN)
     for i in range(20):
