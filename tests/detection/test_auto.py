@@ -11,6 +11,7 @@ from cotarget.detection.background import LARGE
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker, update_tracks
+from tests.support.noise import noisy
 
 NOISE = 2.0  # grey levels, as the simulated sensor's
 TARGET = TargetProfile(1.0, "width", 100.0, "auto")
@@ -38,7 +39,7 @@ def follow(pictures, rate, rng, detector=None):
     assert isinstance(detector, AutoDetector)
     tracker, found = None, []
     for i, picture in enumerate(pictures):
-        image = np.clip(picture + rng.normal(0, NOISE, picture.shape), 0, 255).astype(np.uint8)
+        image = noisy(picture, rng, NOISE)
         tracker = tracker or Tracker(tracking_settings(TARGET), image.shape[1::-1])
         tracks = update_tracks(tracker, detector.detect(Frame(image, i / rate)), i / rate, detector)
         found.append([track for track in tracks if track.confirmed])
@@ -244,8 +245,8 @@ def test_a_dark_target_of_one_colour_is_found_before_a_textured_wall(size):
     detector = BackgroundDetector(LARGE, rate)
     places = [None] * 20 + [(100 + 4 * i, 200) for i in range(50)]
     for i, picture in enumerate(moved(120 + 20 * wall / wall.std(), np.full((*size[::-1], 3), 30.0), places)):
-        image = cv2.GaussianBlur(picture, (0, 0), 0.7) + rng.normal(0, NOISE, picture.shape)
-        boxes = detector.detect(Frame(image.clip(0, 255).astype(np.uint8), i / rate))
+        image = noisy(cv2.GaussianBlur(picture, (0, 0), 0.7), rng, NOISE)
+        boxes = detector.detect(Frame(image, i / rate))
         if i >= 26:
             middle = np.add(places[i], np.array(size) / 2 - 0.5)
             found.append(any(np.abs(each.center_px - middle).max() < 6 for each in boxes))
@@ -262,8 +263,7 @@ def test_a_box_at_the_images_border_is_clipped_wherever_the_camera_points(shift)
         picture = np.roll(background, round(detector.shift[0]), axis=1)
         if i >= 10:
             picture[200:260, 440:] = texture(40, 60, rng)
-        noise = rng.normal(0, NOISE, picture.shape)
-        boxes = detector.detect(Frame((picture + noise).clip(0, 255).astype(np.uint8), i / rate))
+        boxes = detector.detect(Frame(noisy(picture, rng, NOISE), i / rate))
     assert [each.clipped for each in boxes if on([each], (459.5, 229.5), 12)] == [True]
 
 
@@ -272,8 +272,7 @@ def test_the_foreground_of_a_camera_that_pans_is_not_that_of_before():
     detector, background = AutoDetector(rate), scenery((900, 480), rng)
     for i, picture in enumerate(moved(background, texture(60, 80, rng), [None] * 10 + [(200, 200)] * 30)):
         left = max(0, 8 * (i - 20))
-        image = picture[:, left : left + 640] + rng.normal(0, NOISE, (480, 640, 3))
-        detector.detect(Frame(image.clip(0, 255).astype(np.uint8), i / rate))
+        detector.detect(Frame(noisy(picture[:, left : left + 640], rng, NOISE), i / rate))
         if i == 19:
             assert detector.mask[240, 230] == 255
     # The target is at another place now.

@@ -20,6 +20,7 @@ from cotarget.detection.base import MOST_FOREGROUND, flood
 from cotarget.detection.color_template import LARGEST_FITTED_PX, MARGIN_PX, MOST_FITTED, fit_template
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.rig import Frame
+from tests.support.noise import noisy
 
 RATE = 25.0
 NOISE = 2.0  # grey levels, as the simulated sensor's
@@ -40,8 +41,8 @@ def cover():
 
 def photograph(image, rng):
     """Sensor noise and JPEG."""
-    noisy = np.clip(np.rint(image + rng.normal(0, NOISE, image.shape)), 0, 255).astype(np.uint8)
-    return cv2.imdecode(cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, JPEG])[1], cv2.IMREAD_COLOR)
+    coded = cv2.imencode(".jpg", noisy(image, rng, NOISE), [cv2.IMWRITE_JPEG_QUALITY, JPEG])[1]
+    return cv2.imdecode(coded, cv2.IMREAD_COLOR)
 
 
 def book_picture(center, size, turn, rng):
@@ -286,7 +287,7 @@ def test_a_person_is_seen_while_the_sun_comes_out(part):
         picture = ground.copy()
         picture[100:180, 18 + 2 * (i - 20) : 43 + 2 * (i - 20)] = (150, 60, 30)
         picture[:, : round(part * 320)] *= 1 + 0.25 * np.clip((i - 60) / 12, 0, 1)
-        pictures.append(np.clip(picture + rng.normal(0, NOISE, picture.shape), 0, 255).astype(np.uint8))
+        pictures.append(noisy(picture, rng, NOISE))
     for i, boxes in list(enumerate(watch(motion("person"), pictures)))[25:]:
         assert len(boxes) == 1
         np.testing.assert_allclose(boxes[0].center_px, (30 + 2 * (i - 20), 139.5), atol=2.0)

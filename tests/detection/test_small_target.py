@@ -20,6 +20,7 @@ from cotarget.errors import CotargetError
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
+from tests.support.noise import noisy
 
 RATE = 25.0
 NOISE = 2.0  # grey levels, as the simulated sensor's
@@ -50,7 +51,7 @@ def draw(picture, u, v, width, height, grey=60.0):
 
 
 def photograph(picture, rng):
-    return np.clip(np.rint(picture + rng.normal(0, NOISE, picture.shape)), 0, 255).astype(np.uint8)
+    return noisy(picture, rng, NOISE)
 
 
 def watch(pictures, detector=None):
@@ -127,7 +128,7 @@ def test_a_spot_in_a_large_picture_is_found_before_a_sky_and_not_among_leaves(ro
     rng = np.random.default_rng(1)
     leaves = cv2.resize(rng.normal(120, rough, (240, 320)), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
     leaves[478:482, 638:642] = 120 + 60
-    fine = np.clip(np.rint(leaves + rng.normal(0, NOISE, leaves.shape)), 0, 255).astype(np.uint8)
+    fine = photograph(leaves, rng)
     half = cv2.resize(fine, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     boxes = [(*each.low, *each.size) for each in find_small_targets(half, 4.5, 40, finer=[fine])]
     assert any(x <= 639 < x + w and y <= 479 < y + h for x, y, w, h in boxes) == found
