@@ -53,7 +53,7 @@ HELD_S = 60.0
 # Margin around what is held: in parts of its size, and in parts of the image's width.
 HELD_MARGIN, HELD_PART = 0.2, 2 / 640
 # Logarithm of width over height: standard deviation of targets about the expected one, as persons who walk have, and of
-# anything about a square; and part of the targets that may have any shape, such as two persons side by side.
+# anything about a square; and part of the targets that may have any shape, such as a person who lies.
 SHAPE_SIGMA, OTHER_SIGMA, OTHER_PART = 0.5, 1.0, 0.05
 # Clutter: number of cells along the image's width, memory [s], and the usual score that halves a target's odds.
 CELLS, CLUTTER_S, CLUTTER_EVEN = 80, 10.0, 0.03
@@ -255,7 +255,7 @@ def by_shape(found: Detection, shape: float) -> float:
 
 
 def _normal(off: float, sigma: float) -> float:
-    """Density of a normal distribution, but for a factor."""
+    """Density of a normal distribution, up to a constant factor."""
     return math.exp(-((off / sigma) ** 2) / 2) / sigma
 
 

@@ -35,7 +35,7 @@ CORNER_CELLS = (16, 12)
 # alone, the strongest corners are the target and artefacts of the codec.
 LEAST_CORNER = 3e-4
 CORNER_BLOCK = 3
-# With fewer corners the median is no measurement, and the camera is taken to stand still.
+# Fewer corners are no measurement, and the camera is taken to stand still.
 FEWEST = 8
 # Least standard deviation of the corners' places along one axis, over the image's side. Corners nearer together are on
 # a target before a plain background, and the camera is taken to stand still. All over half an image they have 0.144.
@@ -54,7 +54,7 @@ AGREEMENT_PX = 2.0
 
 
 class CameraMotion:
-    """Estimate the camera's shake, nudges and slow turns as the median shift of tracked corners (Lucas and Kanade).
+    """Estimate the camera's shake, nudges and slow turns as the shift that most corners have (Lucas and Kanade).
 
     Only a shift is estimated: the shake and slow turns of a fixed camera hardly rotate the image, and the remainder is
     small beside a target.
@@ -107,7 +107,8 @@ class CameraMotion:
         flow = (ahead - self._corners).reshape(-1, 2)
         alike = kept & _alike(flow, np.median(flow[kept], axis=0) if kept.any() else np.zeros(2))
         standing = kept & _alike(flow, np.zeros(2)) & ~alike
-        # A large target may have more corners than the scene, but the scene extends over more of the image.
+        # A large target may have more corners than the scene, but the scene extends over more of the image. A few
+        # leaves or letters that stand in a shaken image do so too.
         fewest = FEWEST_ALIKE * kept.sum()
         if standing.sum() >= fewest and _spread(self._corners[standing], before) > _spread(
             self._corners[alike], before
@@ -118,7 +119,7 @@ class CameraMotion:
             self._corners = None
             return np.zeros(2)
         self._corners = ahead[kept]
-        return np.array([_middle(flow[alike, axis]) for axis in (0, 1)])
+        return np.array([_shorth(flow[alike, axis]) for axis in (0, 1)])
 
 
 def _corners(picture: Image) -> npt.NDArray[np.float32]:
@@ -139,8 +140,8 @@ def _spread(corners: npt.NDArray[np.float32], picture: Image) -> float:
     return float((corners.std(axis=(0, 1)) / picture.shape[::-1]).max()) if len(corners) else 0.0
 
 
-def _middle(values: Array) -> float:
-    """Mean of the shortest half of values, (n,), about their most frequent one (Rousseeuw 1984).
+def _shorth(values: Array) -> float:
+    """Mean of the shortest half of values, (n,) (Andrews et al. 1972).
 
     Clouds drift by a tenth of a pixel a frame, which their corners, a third of all, would add to the median.
     """

@@ -28,10 +28,10 @@ __all__ = ["Measurement", "Track", "Tracker", "TrackingSettings", "tracking_sett
 IMPOSSIBLE = 1e6
 # What lies to this part in a confirmed track's box, enlarged by a factor, belongs to it: a shoe, a rotor.
 PART, NEAR = 0.5, 1.5
-# An older track in the box of one whose area is larger by this factor is a part of it, such as the hand of a person who
-# comes into view, once both have moved by the part's larger side and at most this part of the way apart. A bird before
-# a cloud does not move with it.
-PART_AREA, APART = 4.0, 0.5
+# A track in the box of a larger one is a part of it, such as the hand of a person who comes into view, if both began
+# within a time [s], the areas differ by a factor, and both have moved by the larger one's smaller side with a relative
+# displacement of less than a part of that. A bird before a cloud does not move with it.
+PART_S, PART_AREA, APART = 0.5, 4.0, 0.25
 
 
 class Tracker:
@@ -50,8 +50,8 @@ class Tracker:
         self._image_size = image_size
         self._tracks: list[LiveTrack] = []
         self._next_id = 1
-        # Centres of a larger and an older smaller track, by their numbers, since when this is in that one's box [px].
-        self._together: dict[tuple[int, int], tuple[Array, Array]] = {}
+        # For numbers of a larger track and of one in its box: both centres when it was first there [px, in the scene].
+        self._inside_since: dict[tuple[int, int], tuple[Array, Array]] = {}
         self._t: float | None = None
         self._shift: Array = np.zeros(2)  # of the scene in the last frame [px]
         self._interval = self._settings.lose_s  # between the last two frames [s]
@@ -102,7 +102,7 @@ class Tracker:
             else:
                 state.missed += 1
         self._tracks = [s for s in self._tracks if not s.is_over(self._image_size)]
-        self._join_parts()
+        self._end_parts()
         least = self._settings.start_score
         self._start_tracks([each for j, each in enumerate(detections) if j not in taken and each.score >= least], t)
         return self.tracks
@@ -136,28 +136,28 @@ class Tracker:
         larger = area[:, None] > area
         return np.any(inside & larger & confirmed[:, None], axis=0).tolist()
 
-    def _join_parts(self) -> None:
-        """End each older part of a track that has moved with it; the whole takes its number."""
+    def _end_parts(self) -> None:
+        """End each track that has come into view as a part of a larger one and has moved with it since."""
         confirmed = [state for state in self._tracks if state.confirmed]
         at, size = _boxes_of(confirmed)
         area = _area(size)
         inside = intersection_areas(at, size, at, size) > PART * area
         inside &= area[:, None] > PART_AREA * area
         at = at - self._shift  # in the scene, since a camera that turns moves all tracks alike
-        together: dict[tuple[int, int], tuple[Array, Array]] = {}
+        inside_since: dict[tuple[int, int], tuple[Array, Array]] = {}
+        over: set[int] = set()
         for i, j in np.argwhere(inside).tolist():
             whole, part = confirmed[i], confirmed[j]
-            if part.number >= whole.number or part not in self._tracks:
+            measured = not any(state.missed or state.shared for state in (whole, part))
+            if not measured or abs(whole.born - part.born) > PART_S:
                 continue
-            then = self._together.get((whole.number, part.number), (at[i], at[j]))
-            way = at[i] - then[0]
-            moved, apart = float(np.hypot(*way)), float(np.hypot(*(way - (at[j] - then[1]))))
-            if moved > size[j].max() and apart < APART * moved:
-                whole.number = part.number
-                self._tracks.remove(part)
-            else:
-                together[whole.number, part.number] = then
-        self._together = together
+            pair = whole.number, part.number
+            start = inside_since[pair] = self._inside_since.get(pair, (at[i], at[j]))
+            displacement, relative = at[i] - start[0], (at[i] - start[0]) - (at[j] - start[1])
+            if np.hypot(*displacement) > size[i].min() and np.hypot(*relative) < APART * np.hypot(*displacement):
+                over.add(part.number)
+        self._tracks = [state for state in self._tracks if state.number not in over]
+        self._inside_since = inside_since
 
     def _most_useful(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
         """Select at most `most_detections` detections, in their order."""

@@ -318,3 +318,22 @@ def test_an_upright_target_is_boxed_without_the_dark_shadow_at_its_feet(shape, w
 
     highest = max(follow(pictures(), rate, rng, detector)[-1], key=lambda track: float(track.size_px[1]))
     assert width[0] < highest.size_px[0] < width[1]
+
+
+def test_the_expected_shape_lowers_the_score_of_others_but_not_of_clipped_ones():
+    """A thing of 60x20 px goes to the image's border."""
+    rate, scores = 25.0, {}
+    for shape in (None, 0.4):
+        rng = np.random.default_rng(23)
+        background, surface = np.full((240, 320, 3), 170.0), texture(60, 20, rng)
+        detector = make_detector(TargetProfile(1.75, "height", 300.0, shape=shape), rate)
+        places = [None] * 10 + [(20 + 8 * i, 100) for i in range(36)]
+        for i, picture in enumerate(moved(background, surface, [each and (min(each[0], 260), 100) for each in places])):
+            found = detector.detect(Frame(noisy(picture, rng, NOISE), i / rate))
+            if i in (30, 45):
+                scores[shape, i] = max(((each.score, each.clipped) for each in found), default=None)
+    assert not scores[None, 30][1]
+    usual, lowered = (score / (1 - score) for score, _ in (scores[None, 30], scores[0.4, 30]))
+    assert lowered < 0.1 * usual
+    assert scores[None, 45][1]
+    assert scores[0.4, 45] == scores[None, 45]

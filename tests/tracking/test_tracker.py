@@ -245,18 +245,23 @@ def test_two_targets_merged_into_one_box_both_live_on():
     assert [np.sign(t.velocity_px[0]) for t in tracks] == [1, -1]
 
 
-def test_a_hand_that_comes_into_view_first_becomes_the_person():
-    """Hand and person are confirmed beside each other, before the person is seen as a whole; both move alike."""
+def comes_into_view(sides, frames=40):
+    """A person whose hands are seen first, at some heights; the tracks in the end."""
     tracker = Tracker(PLAIN, SIZE)
-    for i in range(30):
+    for i in range(frames):
         hand = 600 - 4 * i
-        left = hand + 8 if i < 10 else hand - 20
-        tracks = tracker.update(
-            [seen(hand, 300, 10, 10), seen((left + hand + 60) / 2, 300, hand + 60 - left, 140)], i / RATE
-        )
+        left = hand + 8 - 3 * min(max(0, i - 10), 9)
+        person = seen((left + hand + 60) / 2, 300, hand + 60 - left, 140)
+        tracks = tracker.update([*(seen(hand, v, 10, 10) for v in sides), person], i / RATE)
         if i == 9:
-            assert [track.id for track in tracks] == [1, 2]
-    assert [(track.id, track.size_px.tolist()) for track in tracks] == [(1, [80, 140])]
+            assert len(tracks) == len(sides) + 1
+    return tracks
+
+
+@pytest.mark.parametrize("sides", [(300,), (260, 340)], ids=["a hand", "both hands"])
+def test_hands_that_come_into_view_before_their_person_are_no_further_targets(sides):
+    (track,) = comes_into_view(sides)
+    assert track.size_px[1] == pytest.approx(140)
 
 
 @pytest.mark.parametrize("speed", [0.0, -60.0], ids=["hovers", "flies past"])
@@ -268,18 +273,22 @@ def test_a_bird_before_a_cloud_is_no_part_of_it(speed):
     assert [track.id for track in tracks] == [1, 2]
 
 
-def test_a_part_of_two_targets_becomes_one_of_them():
-    """A small one between two large ones, which come closer together and move alike."""
+@pytest.mark.parametrize("faster", [15.0, 45.0])
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_person_who_overtakes_one_farther_away_does_not_take_the_track(faster, hidden):
+    """Both go the same way, and the farther one may be hidden behind the other."""
     tracker = Tracker(PLAIN, SIZE)
-    for i in range(40):
-        u = 500 - 4 * i
-        beside = 78 - 2 * min(max(0, i - 10), 6)
-        boxes = [seen(u, 240, 10, 10), *(seen(u, 240 + side * beside, 60, 140) for side in (-1, 1))]
-        tracks = tracker.update(boxes if i < 20 or i % 2 else boxes[1:], i / RATE)
-        if i == 9:
-            assert [track.id for track in tracks] == [1, 2, 3]
-    assert [track.size_px.tolist() for track in tracks] == [[60, 140]] * 2
-    assert len({track.id for track in tracks} - {2, 3}) == 1
+    for i in range(200):
+        far, near = 200 + 30 * i / RATE, 140 + (30 + faster) * i / RATE
+        boxes = [seen(near, 250, 60, 150)]
+        if not hidden or abs(far - near) > 42:
+            boxes.append(seen(far, 240, 24, 60))
+        tracks = tracker.update(boxes, i / RATE)
+        if not hidden:
+            assert sorted(track.size_px[0] for track in tracks) == [24, 60]
+        if i == 20:
+            first = next(track.id for track in tracks if track.size_px[0] == 60)
+    assert first in [track.id for track in tracks if track.size_px[0] == 60]
 
 
 def test_a_camera_that_turns_does_not_make_a_bird_part_of_the_cloud_behind_it():
