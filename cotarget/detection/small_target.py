@@ -110,9 +110,8 @@ class CameraMotion:
         # A large target may have more corners than the scene, but the scene extends over more of the image. A few
         # leaves or letters that stand in a shaken image do so too.
         fewest = FEWEST_ALIKE * kept.sum()
-        if standing.sum() >= fewest and _spread(self._corners[standing], before) > _spread(
-            self._corners[alike], before
-        ):
+        farther = _spread(self._corners[standing], before) > _spread(self._corners[alike], before)
+        if farther and standing.sum() >= fewest:
             alike = standing
         if kept.mean() < FOUND_AGAIN or alike.sum() < fewest:
             self.jumped = True
