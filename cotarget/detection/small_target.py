@@ -43,7 +43,7 @@ SPREAD = 0.144
 # Fewest corners, where there were too few before, that show another scene.
 MANY = 24
 # If less than the first part of the corners is found again, or less than the second part of these at one shift, the
-# film was cut or the camera was moved.
+# film was cut or the camera was moved. Standing corners count as the scene's from the second part on.
 FOUND_AGAIN, FEWEST_ALIKE = 0.3, 0.35
 # Frames after which corners are detected again, because some have drifted off and some are on a target.
 RENEW_FRAMES = 15
@@ -107,8 +107,8 @@ class CameraMotion:
         flow = (ahead - self._corners).reshape(-1, 2)
         alike = kept & _alike(flow, np.median(flow[kept], axis=0) if kept.any() else np.zeros(2))
         standing = kept & _alike(flow, np.zeros(2)) & ~alike
-        # A large target may have more corners than the scene, but the scene extends over more of the image. A few
-        # leaves or letters that stand in a shaken image do so too.
+        # A large target may have more corners than the scene, but the scene extends over more of the image. So may
+        # leaves or letters that stand in a shaken image, but they are few.
         fewest = FEWEST_ALIKE * kept.sum()
         farther = _spread(self._corners[standing], before) > _spread(self._corners[alike], before)
         if farther and standing.sum() >= fewest:
