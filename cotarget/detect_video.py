@@ -16,7 +16,7 @@ from cotarget.config import TargetProfile
 from cotarget.detection import make_detector
 from cotarget.drawing import BOX_MARGIN_PX, draw_box, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
-from cotarget.files import CsvFile
+from cotarget.files import CsvFile, check_writable
 from cotarget.geometry import Array
 from cotarget.parallel import Progress
 from cotarget.rig import Image
@@ -177,6 +177,7 @@ def labels_of_film(video: Path, file: Path) -> dict[int, list[Label]]:
     labels = read_labels(file)
     with Film(video) as film:
         width, height = film.size
+        next(iter(film))  # one that cannot be decoded is refused now
     centers = np.array([label.center_px for boxes in labels.values() for label in boxes])
     outside = int(((centers < 0) | (centers >= (width, height))).any(axis=1).sum())
     if outside > len(centers) / 2:
@@ -205,9 +206,12 @@ def labelled_films(folder: Path, labels: Path) -> list[tuple[Path, Path]]:
         ConfigError: there is no film, two have one name, or a film has no labels.
     """
     pairs: list[tuple[Path, Path]] = []
-    for film in sorted(each for each in folder.iterdir() if each.suffix.lower() in FILMS):
-        if pairs and pairs[-1][0].stem == film.stem:
-            raise ConfigError(f"{film}: has the name of {pairs[-1][0].name}; their tables would be one")
+    named: dict[str, Path] = {}
+    for film in sorted(folder.iterdir()):
+        if film.suffix.lower() not in FILMS or film.name.startswith("."):  # a hidden file is an unfinished copy
+            continue
+        if named.setdefault(film.stem, film) != film:
+            raise ConfigError(f"{film}: has the name of {named[film.stem].name}; their tables would be one")
         files = [labels / f"{film.stem}{suffix}" for suffix in LABEL_FILES]
         found = next((file for file in files if file.is_file()), None)
         if found is None:
@@ -244,6 +248,8 @@ def run_on_folder(
         CotargetError: a film or its labels cannot be read, or a file cannot be written.
     """
     results, scores, tiles, minutes = {}, [], [], 0.0
+    if sheet is not None:
+        check_writable(sheet)
     labels = [labels_of_film(*pair) for pair in films]  # an error before the long work, not after it
     for i, ((film, _), boxes) in enumerate(zip(films, labels, strict=True)):
         progress(i, len(films), film.stem)

@@ -287,7 +287,8 @@ def read_table(
             if missing := [name for name in columns if name not in there]:
                 raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(columns)}")
             parsers = {**columns, **{name: read for name, read in (optional or {}).items() if name in there}}
-            for line, row in enumerate(reader, start=2 if names is None else 1):
+            for row in reader:
+                line = reader.line_num
                 if None in row.values():
                     raise ValueError(f"line {line} is cut off; it wants {', '.join(parsers)}")
                 for name, read in parsers.items():

@@ -72,9 +72,9 @@ class Criterion:
 
     Attributes:
         iou: least intersection over union.
-        small_px: if the larger side of either box is at most this, the distance of the centres decides instead: it may
-            be as much as the label's larger side. Labelled boxes of specks are several times as large as the speck, so
-            that overlap says little. 0 for overlap alone, inf for distance alone.
+        small_px: if the larger side of either box is at most this, the track's centre decides instead, because labels
+            of specks are several times as large as the speck. It must be within the larger side of a label that is as
+            small, and in the box of a larger label. 0 for overlap alone, inf for distance alone.
     """
 
     iou: float = 0.3
@@ -88,8 +88,11 @@ class Criterion:
         center, extent = (np.array([getattr(each, name) for each in tracks]) for name in ("center_px", "size_px"))
         shared = intersection_areas(at, size, center, extent)
         iou = shared / (np.add.outer(size.prod(axis=-1), extent.prod(axis=-1)) - shared)
-        side = size.max(axis=-1)[:, None]
-        near = 1 - (1 - self.iou) * np.linalg.norm(at[:, None] - center, axis=-1) / side  # `iou` at one side's distance
+        side, off = size.max(axis=-1)[:, None], np.abs(at[:, None] - center)
+        distance = np.linalg.norm(off, axis=-1) / side
+        inside = (off <= size[:, None] / 2).all(axis=-1)
+        on = np.where(side <= self.small_px, distance <= 1, inside)
+        near = np.where(on, 1 - (1 - self.iou) * distance, -1.0)
         return np.where(np.minimum(side, extent.max(axis=-1)) <= self.small_px, near, iou)
 
 
@@ -196,14 +199,15 @@ def match_frames(
         kept = np.array([[before.get(label.target) == each.track for each in found] for label in counted])
         value = np.where(enough, similar + KEPT * kept.reshape(similar.shape), 0.0)
         rows, columns = linear_sum_assignment(-value)
-        pairs = [(counted[i], found[j]) for i, j in zip(rows, columns, strict=True) if enough[i, j]]
+        matched = [(i, j) for i, j in zip(rows.tolist(), columns.tolist(), strict=True) if enough[i, j]]
+        pairs = [(counted[i], found[j]) for i, j in matched]
         before = {label.target: each.track for label, each in pairs}
-        right, ids = {each.track for _, each in pairs}, {label.target for label, _ in pairs}
+        right, labels_found = {each.track for _, each in pairs}, {i for i, _ in matched}
         excused: list[bool] = np.any(criterion.similarity(ignored, found) >= least, axis=0).tolist()
         wrong = [each for each, excuse in zip(found, excused, strict=True) if each.track not in right and not excuse]
         judged = right | {each.track for each in wrong}
         near = [(counted[i].target, found[j].track) for i, j in np.argwhere(enough) if found[j].track in judged]
-        missed = [label for label in counted if label.target not in ids]
+        missed = [label for i, label in enumerate(counted) if i not in labels_found]
         matches.append(FrameMatch(frame, pairs, missed, wrong, near))
     return matches
 
@@ -460,7 +464,7 @@ def read_labels(path: Path) -> dict[int, list[Label]]:
     has no header; its frames and pixels count from 1, and boxes marked with 0 do not count.
 
     Raises:
-        ConfigError: the file is missing, is no such table, or has no row.
+        ConfigError: the file is missing, is no such table, has no row, or one target has two boxes in a frame.
     """
     labels: dict[int, list[Label]] = {}
     for frame, target, x, y, width, height, counts in _label_rows(path):
@@ -473,6 +477,11 @@ def read_labels(path: Path) -> dict[int, list[Label]]:
         size, boxes = np.array([width, height]), labels.setdefault(int(frame), [])
         # A box of w pixels from column x covers columns x to x + w - 1.
         number = len(boxes) + 1 if target is None else int(target)
+        if counts and any(each.counts and each.target == number for each in boxes):
+            frame += _is_mot(path)
+            raise ConfigError(
+                f"{path}: frame {frame:g} has two boxes of target {number}; each wants a number of its own"
+            )
         boxes.append(Label(np.array([x, y]) + (size - 1) / 2, size, number, bool(counts)))
     if not labels:
         raise ConfigError(f"{path}: holds no label, but for the names of its columns; it wants a row for each box")
@@ -487,7 +496,7 @@ def _label_rows(path: Path) -> Iterable[tuple[float, float | None, float, float,
             frame, target, left, top, *rest = (row[name] for name in MOT_COLUMNS)
             yield frame - 1, target, left - 1, top - 1, *rest
     else:
-        for row in read_table(path, dict.fromkeys(LABELS, _finite), "table of labels", optional={"target": _finite}):
+        for row in read_table(path, dict.fromkeys(LABELS, _finite), "table of labels", optional={"target": _whole}):
             frame, *box = (row[name] for name in LABELS)
             yield frame, row.get("target"), *box, 1.0
 
@@ -514,6 +523,13 @@ def read_tracks(path: Path) -> list[Tracked]:
             (row[name] for name in names) for row in read_table(path, dict.fromkeys(names, _finite), "table of tracks")
         )
     ]
+
+
+def _whole(text: str) -> int:
+    value = _finite(text)
+    if value != int(value):
+        raise ValueError(text)
+    return int(value)
 
 
 def _finite(text: str) -> float:

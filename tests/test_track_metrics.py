@@ -150,6 +150,33 @@ def test_small_boxes_are_matched_by_distance_and_others_by_overlap(off, iou, sma
     assert score_tracks(tracks, labels, RATE, 1, 0, Criterion(iou, small_px)).found == found
 
 
+@pytest.mark.parametrize(("off", "found"), [(95, 1), (105, 0), (190, 0)])
+def test_the_centre_of_a_small_track_is_in_the_box_of_a_large_label(off, found):
+    labels, at = {0: [Label(np.array([300.0, 300.0]), np.array([200.0, 200.0]))]}, np.array([300.0 + off, 300.0])
+    tracks = [Tracked(at, np.array([10.0, 10.0]), 0, 0.0, 1)]
+    assert score_tracks(tracks, labels, RATE, 1, 0).found == found
+
+
+def test_a_small_box_far_away_is_not_found_even_where_full_overlap_is_wanted():
+    labels, tracks = boxes_of(Label, [(0, 1, 100)]), boxes_of(Tracked, [(0, 1, 200)])
+    assert score_tracks(tracks, labels, RATE, 1, 0, Criterion(1.0, 40.0)).found == 0
+
+
+def test_boxes_of_one_number_in_a_frame_count_each():
+    labels, tracks = boxes_of(Label, [(0, -1, 100), (0, -1, 300), (0, -1, 500)]), boxes_of(Tracked, [(0, 1, 100)])
+    score = score_tracks(tracks, labels, RATE, 1, 0)
+    assert (score.boxes, score.recall) == (3, 1 / 3)
+
+
+def test_two_boxes_of_one_target_in_a_frame_are_refused(tmp_path):
+    path = tmp_path / "gt.txt"
+    path.write_text("1,7,10,10,20,20,1\n1,7,50,10,20,20,1\n")
+    with pytest.raises(ConfigError, match="frame 1 has two boxes of target 7; each wants a number of its own"):
+        read_labels(path)
+    path.write_text("1,7,10,10,20,20,1\n1,7,50,10,20,20,0\n")  # the second does not count
+    assert len(read_labels(path)[0]) == 2
+
+
 def test_a_pair_stays_while_it_is_near_enough():
     labels = boxes_of(Label, [(0, 1, 100), (1, 1, 100)])
     tracks = boxes_of(Tracked, [(0, 1, 100), (1, 1, 105), (1, 2, 100)])
@@ -232,6 +259,8 @@ def test_labels_may_begin_with_a_byte_order_mark(tmp_path):
     (["1,2,3,4"], HEAD, "line 2"),
     (["1,2,3,4,5", "2,nan,3,4,5"], HEAD, "line 3 has 'nan' for x_px"),
     (["1,2,3,x,5"], HEAD, "line 2 has 'x' for width_px"),
+    (["", "1,2,3,x,5"], HEAD, "line 3 has 'x' for width_px"),
+    (["1,2,3,4,5,1.5"], f"{HEAD},target", "line 2 has '1.5' for target"),
     (["1,2,3,0,5"], HEAD, "a label"),
     (["1.5,2,3,4,5"], HEAD, "a label"),
     (["-1,2,3,4,5"], HEAD, "a label"),
@@ -323,7 +352,7 @@ def test_the_command_scores_a_folder_of_films(folder, capsys):
     assert np.median(dark[:, 1]) == pytest.approx(49.5, abs=5)
 
 
-def test_labels_of_another_film_are_told_and_not_pooled(folder, capsys):
+def test_labels_of_another_film_are_reported_and_not_pooled(folder, capsys):
     labels = folder / "films" / "two.csv"
     labels.write_text("frame,x_px,y_px,width_px,height_px\n5000,5,5,9,9\n")
     assert detect_folder(folder) == 0
@@ -336,7 +365,7 @@ def test_labels_of_another_film_are_told_and_not_pooled(folder, capsys):
     assert (pooled["films"], pooled["recall"], pooled["false_tracks"]) == (1, 1.0, 0)
 
 
-def test_labels_of_the_first_frames_alone_are_told(folder, capsys):
+def test_labels_of_the_first_frames_alone_are_reported(folder, capsys):
     labels = folder / "films" / "two.csv"
     labels.write_text("frame,x_px,y_px,width_px,height_px\n29,5,5,9,9\n")
     assert detect_folder(folder) == 0
@@ -378,10 +407,25 @@ def test_a_folder_that_cannot_be_scored_is_refused(folder, capsys, labels, more,
     assert re.fullmatch(rf"cotarget detect: .*{named}.*\n", err)
 
 
-def test_two_films_of_one_name_are_refused(folder, capsys):
-    (folder / "films" / "one.avi").touch()
+@pytest.mark.parametrize("between", ["", "one.b.mp4"])
+def test_two_films_of_one_name_are_refused(folder, capsys, between):
+    for name in filter(None, ("one.avi", between)):
+        (folder / "films" / name).touch()
+        (folder / "films" / name).with_suffix(".csv").touch()
     assert detect_folder(folder) == 1
     assert "one.mp4: has the name of one.avi" in capsys.readouterr().err
+
+
+def test_a_hidden_file_is_no_film(folder, capsys):
+    (folder / "films" / ".one.part.mp4").touch()
+    assert detect_folder(folder) == 0
+    assert json.loads(capsys.readouterr().out)["pooled"]["films"] == 2
+
+
+def test_a_sheet_that_cannot_be_written_is_refused_before_the_search(folder, capsys):
+    assert detect_folder(folder, "--sheet", "/proc/sheet.png") == 1
+    assert "/proc/sheet.png" in capsys.readouterr().err
+    assert not list((folder / "tables").iterdir())
 
 
 def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):

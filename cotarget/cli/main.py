@@ -326,7 +326,10 @@ def _add_inspection(command: Command) -> None:
     _add_file(detect, "--sheet", "write a picture of the longest misses and false tracks in a folder of videos", "PNG")
     about = "least intersection over union of a track on a label (0.3)"
     detect.add_argument("--iou", type=ratio, default=0.3, metavar="R", help=about)
-    about = "judge boxes up to this side by the distance of their centres, at most the label's larger side (24)"
+    about = (
+        "judge boxes up to this side by their centres: at most the label's larger side apart, or the track's in a "
+        "larger label (24)"
+    )
     detect.add_argument("--small-px", type=length, default=24.0, metavar="N", help=about)
 
     board = command("board", calibrating.board_command, "write a calibration board to print, to scale")

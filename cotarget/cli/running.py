@@ -15,6 +15,7 @@ from cotarget.cli.common import (
     check_outputs,
     load_plausible,
     naming,
+    previous_kept,
     print_json,
     progress_bar,
     rig_files,
@@ -170,7 +171,7 @@ def demo_command(options: argparse.Namespace) -> None:
     """Run `cotarget demo`: calibrate a simulated rig and follow a book, a person and a bird."""
     from cotarget.demo import run_demo, summary
 
-    with progress_bar() as progress:
+    with progress_bar() as progress, previous_kept(options.out / "calibration.json"):
         metrics = run_demo(options.out, options.seed, progress)
     print(summary(metrics))
     print(f"pictures, video and metrics.json are in {options.out} ({metrics['wall_s']:.0f} s)")
