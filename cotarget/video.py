@@ -123,6 +123,21 @@ MICROSECONDS = 1e6  # FFmpeg's units of duration per second
 SHORT_S, SHORT_FRAMES = 0.5, 3
 
 
+def _url(path: Path) -> str:
+    """Path of a film for FFmpeg, which would take what leads a colon in a relative one for a protocol."""
+    return str(path.absolute())
+
+
+def _quarter_turns(path: Path) -> int:
+    """Quarter turns to the left by which players show a film, as one taken with an upright phone; 0 if unknown."""
+    if not path.is_file():  # a pipe is read once
+        return 0
+    with contextlib.suppress(av.error.FFmpegError, OSError), av.open(_url(path)) as container:
+        for picture in container.decode(video=0):
+            return round(picture.rotation / 90) % 4
+    return 0
+
+
 class Film:
     """Read a film: iterate over it for its frames. A context manager.
 
@@ -132,7 +147,7 @@ class Film:
 
     Attributes:
         path: file of the film.
-        size: (width, height) [px].
+        size: (width, height) [px], of the picture as players turn it.
         rate_hz: mean frame rate [Hz].
         count: number of frames by the header; None if it has none.
         number: number of the newest frame, from 0. Frames that cannot be decoded have numbers too, so that labels by
@@ -153,7 +168,7 @@ class Film:
             raise CotargetError(f"{path}: no such file; give the path of a film")
         self.path = path
         try:
-            self._container = av.open(str(path))
+            self._container = av.open(_url(path))
         except (av.error.FFmpegError, OSError, ValueError) as error:
             raise CotargetError(
                 f"{path}: cannot be read as a film ({reason_of(error)}); give e.g. an mp4 or avi"
@@ -163,7 +178,10 @@ class Film:
             raise CotargetError(f"{path}: has no video stream; give a film with pictures")
         stream = self._container.streams.video[0]
         stream.thread_type = "AUTO"
+        self._turns = _quarter_turns(path)
         self.size = (int(stream.width), int(stream.height))
+        if self._turns % 2:
+            self.size = self.size[::-1]
         self.rate_hz = float(stream.average_rate or stream.guessed_rate or FALLBACK_RATE_HZ)
         self.count: int | None = stream.frames or None
         self.number = -1
@@ -192,6 +210,8 @@ class Film:
         try:
             for picture in self._pictures(places):
                 image, damaged = picture.to_ndarray(format="bgr24"), picture.is_corrupt
+                if self._turns:
+                    image = np.ascontiguousarray(np.rot90(image, self._turns))
                 if (image.shape[1], image.shape[0]) != size:
                     raise CotargetError(
                         f"{self.path}: the picture's size changes from {size[0]}x{size[1]} to "
@@ -439,10 +459,10 @@ class _FilmFile:
 
 def join_films(parts: Sequence[Path], path: Path) -> None:
     """Concatenate films of one size and rate, as `FilmWriter` writes them, without encoding them again."""
-    with av.open(str(path), "w") as joined:
+    with av.open(_url(path), "w") as joined:
         stream, shift = None, 0
         for part in parts:
-            with av.open(str(part)) as film:
+            with av.open(_url(part)) as film:
                 source = film.streams.video[0]
                 if stream is None:
                     stream = joined.add_stream_from_template(source)

@@ -3,8 +3,10 @@
 import csv
 import json
 import re
+import struct
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import cv2
@@ -57,6 +59,32 @@ def test_frames_are_shown_at_their_own_times(tmp_path, suffix):
     with av.open(str(path)) as container:
         assert container.metadata.get("creation_time", "").startswith("2024-02-29T23:59:58")
         assert container.duration == pytest.approx(1e6 * (shown[-1] + 1 / RATE), abs=2e3)
+
+
+@pytest.mark.parametrize(("matrix", "size"), [
+    ((0, 1, -1, 0), (122, 162)),  # taken with a phone that was held upright
+    ((-1, 0, 0, -1), (162, 122)),
+    ((0, -1, 1, 0), (122, 162)),
+])  # fmt: skip
+def test_a_film_is_turned_as_players_turn_it(tmp_path, matrix, size):
+    path, unit = tmp_path / "a.mp4", 0x10000
+    bird_film(path, 3)
+    content = path.read_bytes()
+    straight = struct.pack(">9i", unit, 0, 0, 0, unit, 0, 0, 0, 0x40000000)
+    at = content.index(straight, content.rindex(b"tkhd"))  # of the last header, which counts
+    a, b, c, d = (unit * each for each in matrix)
+    path.write_bytes(content[:at] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 0x40000000) + content[at + 36 :])
+    _, shown = cv2.VideoCapture(str(path)).read()
+    with Film(path) as film:
+        assert film.size == size
+        np.testing.assert_array_equal(next(iter(film)).image, shown)
+
+
+def test_a_name_may_have_a_colon(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    bird_film(Path("12:30:00.mp4"), 3)
+    with Film(Path("12:30:00.mp4")) as film:
+        assert len(list(film)) == 3
 
 
 def test_films_that_cannot_be_read_name_the_file(tmp_path):
