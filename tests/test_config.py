@@ -170,6 +170,14 @@ def test_all_false_switches_every_effect_off():
     assert effects == SimEffects(**dict.fromkeys(SimEffects.__dataclass_fields__, False) | {"multisampling": True})
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_numbered_target_of_ones_own_has_the_settings_of_its_kind_in_any_order(order):
+    car = {"dimension": "width", "size": 4.5, "wanted_px": 200.0}
+    tables = list({"car": car, "car2": {"wanted_px": 99.0}}.items())[::order]
+    config = parse_config({"targets": dict(tables)})
+    assert (config.target("car2").size, config.target("car2").wanted_px) == (4.5, 99.0)
+
+
 def test_numbered_target_defaults_to_its_kind():
     config = parse_config(
         {
