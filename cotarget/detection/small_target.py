@@ -66,8 +66,9 @@ class CameraMotion:
     def __init__(self) -> None:
         """Start with no shift."""
         self._last: Image | None = None
-        self._corners: npt.NDArray[np.float32] | None = None
-        self._age = 0
+        self._corners = self._first = np.zeros((0, 1, 2), np.float32)  # now, and where each was detected
+        self._before = np.zeros(2)  # shift of the image in which they were detected
+        self._age = RENEW_FRAMES
         self._shift = np.zeros(2)
         self.jumped = False
 
@@ -83,23 +84,27 @@ class CameraMotion:
         size = (max(1, grey.shape[1] // SCALE), max(1, grey.shape[0] // SCALE))
         half = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         if self._last is not None:
-            self._shift = self._shift + SCALE * self._step(self._last, half)
+            self._step(self._last, half)
         self._last = half
         return self._shift
 
-    def _step(self, before: Image, after: Image) -> Array:
-        """Shift between two frames [px of the reduced image]."""
+    def _step(self, before: Image, after: Image) -> None:
+        """Update the shift from one image of reduced size to the next.
+
+        It is measured since the corners were detected and not from frame to frame: clouds, which drift by a tenth of a
+        pixel a frame, are then distinguished from the scene, and their drift does not add up.
+        """
         self.jumped = False
         self._age += 1
-        if self._corners is None or self._age >= RENEW_FRAMES:
-            self._corners = _corners(before)
+        if self._age >= RENEW_FRAMES:
+            self._begin(_corners(before))
             self._age = 0
         if len(self._corners) < FEWEST or _spread(self._corners, before) < SPREAD:
             # A film that goes on in another place: where there was sky alone, there are many corners at once.
             come = _corners(after)
             self.jumped = len(self._corners) < FEWEST and len(come) >= MANY and _spread(come, after) >= SPREAD
-            self._corners = come
-            return np.zeros(2)
+            self._begin(come)
+            return
         ahead, found, _ = cv2.calcOpticalFlowPyrLK(
             before, after, self._corners, None, winSize=WINDOW_PX, maxLevel=LEVELS
         )
@@ -114,11 +119,16 @@ class CameraMotion:
         if farther and standing.sum() >= fewest:
             alike = standing
         if kept.mean() < FOUND_AGAIN or alike.sum() < fewest:
-            self.jumped = True
-            self._corners = None
-            return np.zeros(2)
-        self._corners = ahead[kept]
-        return np.array([_shorth(flow[alike, axis]) for axis in (0, 1)])
+            self.jumped, self._age = True, RENEW_FRAMES
+            return
+        way = (ahead - self._first).reshape(-1, 2)[alike]
+        self._corners, self._first = ahead[kept], self._first[kept]
+        self._shift = self._before + SCALE * np.array([_shorth(way[:, axis]) for axis in (0, 1)])
+
+    def _begin(self, corners: npt.NDArray[np.float32]) -> None:
+        """Measure the shift by these corners, from the image on that they were detected in."""
+        self._corners = self._first = corners
+        self._before = self._shift
 
 
 def _corners(picture: Image) -> npt.NDArray[np.float32]:
@@ -140,10 +150,7 @@ def _spread(corners: npt.NDArray[np.float32], picture: Image) -> float:
 
 
 def _shorth(values: Array) -> float:
-    """Mean of the shortest half of values, (n,) (Andrews et al. 1972).
-
-    Clouds drift by a tenth of a pixel a frame, which their corners, a third of all, would add to the median.
-    """
+    """Mean of the shortest half of values, (n,) (Andrews et al. 1972), which corners on clouds do not change."""
     ordered, half = np.sort(values), len(values) // 2
     first = int(np.argmin(ordered[half:] - ordered[: len(ordered) - half]))
     return float(ordered[first : first + half + 1].mean())
@@ -723,7 +730,7 @@ class SmallTargetDetector:
         unit = 2 ** len(finer)
         shift = self.camera.update(grey)  # measured without enlargement, in which soft scenes have no corners
         self.shift = unit * shift
-        grey, times = _enlarged(grey)
+        grey, times = (grey, 1) if finer else _enlarged(grey)
         shift = times * shift
         if self.camera.jumped:
             self._history.clear()
@@ -733,6 +740,7 @@ class SmallTargetDetector:
         self.mask = np.zeros(frame.image.shape[:2], np.uint8)
         if self.repeated or self._history.span < self._warm_up_s:
             return []
+        self._warm_up_s = WARM_UP_S
         shape = tuple(times * side for side in frame.image.shape[:2])
         found: list[tuple[SmallTarget, Detection]] = []
         arrived: list[tuple[SmallTarget, Detection]] = []

@@ -307,12 +307,13 @@ def test_clouds_that_drift_do_not_move_the_scene():
     rng = np.random.default_rng(15)
     scene = cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT, WIDTH, 3)), (0, 0), 2.0)
     scene = 110 + 30 * scene / scene.std()
-    clouds, camera = scene[: HEIGHT // 3, ::-1].copy(), CameraMotion()
-    for i in range(100):
+    clouds = cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT // 3, WIDTH, 3)), (0, 0), 6.0)
+    clouds, camera = 180 + 20 * clouds / clouds.std(), CameraMotion()
+    for i in range(500):  # for 20 s
         M = np.column_stack([np.eye(2), [-0.25 * i, 0.0]])
         scene[: HEIGHT // 3] = cv2.warpAffine(clouds, M, (WIDTH, HEIGHT // 3), borderMode=cv2.BORDER_WRAP)
         shift = camera.update(cv2.cvtColor(photograph(scene, rng), cv2.COLOR_BGR2GRAY))
-        assert np.abs(shift).max() < 0.5
+        assert np.abs(shift).max() < 0.3
 
 
 def test_a_cut_is_noticed_and_a_sky_without_corners_stands():
