@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.detection.background import LARGE, PERSON, BackgroundDetector
+from cotarget.detection.background import LARGE, PERSON, WIDE, BackgroundDetector
 from cotarget.detection.base import Detection
 from cotarget.detection.small_target import WEIGHTS, SmallTargetDetector, Weights
 from cotarget.geometry import Array, intersection_areas
@@ -74,7 +74,7 @@ class AutoDetector:
         """
         self._shape = shape
         self._small = SmallTargetDetector(LEAST_SCORE, weights)
-        upright = shape is not None and shape < 1
+        upright = shape is not None and shape < WIDE
         self._large = BackgroundDetector(replace(LARGE, flat=PERSON.flat) if upright else LARGE, rate_hz)
         self._clutter = Clutter()
         self._width = 0

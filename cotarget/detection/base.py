@@ -19,8 +19,8 @@ from cotarget.errors import CotargetError
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
-# Largest part of foreground that may be small targets; beyond it, the light or the camera has changed.
-MOST_FOREGROUND = 0.3
+# Largest part of foreground that may be targets; beyond it, the light or the camera has changed.
+MOST_FOREGROUND = 0.5
 
 
 @dataclass(frozen=True)

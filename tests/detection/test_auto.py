@@ -89,6 +89,31 @@ def test_an_own_target_of_any_shape_is_found(size):
     assert len({track.id for each in right for track in each}) == 1
 
 
+def test_a_target_that_covers_two_fifths_of_the_image_is_found():
+    rng, rate, size = np.random.default_rng(2), 25.0, (320, 400)
+    background = scenery((640, 480), rng)
+    street = np.concatenate(
+        [np.fliplr(background), background, np.fliplr(background)], axis=1
+    )  # it comes in and leaves
+    places = [None] * 15 + [(320 + 8 * i, 40) for i in range(80)]
+    pictures = [picture[:, 640:1280] for picture in moved(street, texture(*size, rng), places)]
+    right = [
+        bool(on(each, np.array(place) - (640, 0) + np.array(size) / 2, 40))
+        for each, place in zip(follow(pictures, rate, rng), places, strict=True)
+        if place and 640 <= place[0] <= 960
+    ]
+    assert np.mean(right) >= FOUND
+
+
+@pytest.mark.parametrize("width", [959, 961, 963])
+def test_images_about_as_wide_as_those_that_are_halved(width):
+    rng, rate = np.random.default_rng(4), 25.0
+    background, surface = scenery((width, 479), rng), texture(8, 8, rng) // 4
+    places = [None] * 10 + [(200 + 4 * i, 80) for i in range(30)]
+    tracks = follow(moved(background, surface, places), rate, rng)
+    assert on(tracks[-1], np.add(places[-1], 3.5), 3)
+
+
 @pytest.mark.parametrize(("size", "rough"), [((60, 150), 0.0), ((250, 100), 3.0)])
 def test_a_large_target_before_a_plain_wall_is_not_taken_for_the_cameras_motion(size, rough):
     """Most corners in the image are the target's; the wall has none, or faint ones (grey levels)."""
@@ -280,14 +305,15 @@ def test_the_foreground_of_a_camera_that_pans_is_not_that_of_before():
 
 
 def test_a_place_that_is_held_may_lie_outside_the_image():
-    """A track near the border, and a camera that has been nudged."""
-    rng, rate = np.random.default_rng(8), 25.0
+    """A track near the border, and a camera that has been nudged: what the image shows is learnt."""
+    rng, rate = np.random.default_rng(8), 5.0
     detector = BackgroundDetector(LARGE, rate)
-    detector.shift = np.array([5.0, 0.0])
-    detector.held = [(np.array([u, 100.0]), np.array([10.0, 10.0])) for u in (-300.0, 700.0)]
-    picture = scenery((640, 480), rng)
-    for i in range(20):
-        assert detector.detect(Frame(picture.astype(np.uint8), i / rate)) == []
+    detector.held = [(np.array([u, 130.0]), np.array([10.0, 60.0])) for u in (-300.0, 700.0)]
+    pictures = list(moved(scenery((640, 480), rng), texture(40, 60, rng), [None] * 10 + [(320, 100)] * 200))
+    found = [detector.detect(Frame(picture.astype(np.uint8), i / rate)) for i, picture in enumerate(pictures)]
+    assert len(found[12]) == 1
+    assert not found[-1]
+    assert not detector.mask.any()
 
 
 @pytest.mark.parametrize(("size", "score"), [
