@@ -39,7 +39,7 @@ MIXTURE = "MOG2 alone"
 # Lead of the aim [s].
 LEAD_S = 0.1
 STAGES = ("detect_ms", "track_ms", "aim_ms")
-WANTED = {"motion": 1.5, "speck": 2.5, "auto": 2.5}  # goal: largest ratio to the subtraction alone
+WANTED = {"motion": 1.5, "speck": 2.5, "auto": 2.0}  # goal: largest ratio to the subtraction alone
 
 
 @dataclass(frozen=True)

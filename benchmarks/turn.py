@@ -32,7 +32,12 @@ UNTIMED = 60  # frames, while the background is learnt
 PERCENTILES = (50, 95, 99)
 # What is timed in a turn; the rest is the choice of the target and the control of head and lens.
 PARTS: Mapping[str, tuple[tuple[type, str], ...]] = {
-    "detect": ((AutoDetector, "detect"), (BackgroundDetector, "detect"), (SmallTargetDetector, "detect")),
+    "detect": (
+        (AutoDetector, "detect"),
+        (AutoDetector, "hold"),
+        (BackgroundDetector, "detect"),
+        (SmallTargetDetector, "detect"),
+    ),
     "track": ((Tracker, "update"),),
     "position": ((TargetFusion, "update_fixed"),),
     "close_up": ((TargetFusion, "update_zoom"),),

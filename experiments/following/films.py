@@ -124,7 +124,15 @@ class LabelledFilm:
 def labelled_film(video: Path, labels: Path) -> LabelledFilm:
     """Read a film and its labels."""
     with Film(video) as film:
-        return LabelledFilm(video.stem, list(film), film.rate_hz, read_labels(labels), unlabelled_flyers(video.stem))
+        return LabelledFilm(video.stem, list(film), film.rate_hz, labels_of(labels), unlabelled_flyers(video.stem))
+
+
+def labels_of(path: Path) -> dict[int, list[Label]]:
+    """Read the labels of a film of the collection, whose pixels count from 1."""
+    return {
+        frame: [replace(label, center_px=label.center_px - 1) for label in labels]
+        for frame, labels in read_labels(path).items()
+    }
 
 
 def unlabelled_flyers(film: str) -> dict[int, list[Box]]:

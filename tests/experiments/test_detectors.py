@@ -39,7 +39,7 @@ def test_the_first_of_five_is_in_view_before_the_shortest_run_ends(kind):
 
 
 class Seer:
-    """Finds what it is told."""
+    """Finds what it is given."""
 
     mask = None
 
