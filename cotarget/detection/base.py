@@ -20,7 +20,7 @@ from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
 # Largest part of foreground that may be targets; beyond it, the light or the camera has changed.
-MOST_FOREGROUND = 0.5
+MOST_FOREGROUND = 0.45
 
 
 @dataclass(frozen=True)
