@@ -65,6 +65,13 @@ class AxisFilter:
             P.position - gain * P.position, P.cross - gain * P.cross, P.velocity - velocity_gain * P.cross
         )
 
+    def correct_velocity(self, measured: float, variance: float) -> None:
+        """Correct the velocity of a new filter with a measured one [px/s] and its variance [px^2/s^2]."""
+        P = self.covariance
+        gain = P.velocity / (P.velocity + variance)
+        self.velocity += gain * (measured - self.velocity)
+        self.covariance = AxisCovariance(P.position, P.cross, P.velocity - gain * P.velocity)
+
 
 # Histories of a track's size and travel
 
@@ -85,9 +92,14 @@ class SizeHistory:
         larger_side: largest of the larger sides [px].
     """
 
-    def __init__(self, span_s: float) -> None:
-        """Create a history without boxes, over a window of time [s]."""
-        self._span_s = span_s
+    def __init__(self, span_s: float, trend: bool = False) -> None:
+        """Create a history without boxes.
+
+        Args:
+            span_s: window of the sizes [s].
+            trend: whether the newest count more where the target grows or shrinks.
+        """
+        self._span_s, self._trend = span_s, trend
         self._boxes: deque[tuple[float, tuple[float, float], bool]] = deque()  # time, size, whether it is clipped
         self.size: Array = np.zeros(2)
         self.larger_side = 0.0
@@ -101,8 +113,23 @@ class SizeHistory:
         # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones.
         whole = [sides for _, sides, is_cut in boxes if not is_cut]
         counted, middle = (whole, statistics.median) if whole else ([sides for _, sides, _ in boxes], max)
-        self.size = np.array([middle(lengths) for lengths in zip(*counted, strict=True)])
+        usual = _newest(counted) if self._trend else counted
+        self.size = np.array([middle(lengths) for lengths in zip(*usual, strict=True)])
         self.larger_side = _quantile([max(sides) for sides in counted], BEAT_PART)
+
+
+def _newest(boxes: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
+    """Of sizes in the order of time, those that are usual now: all, or the last third if the target grows or shrinks.
+
+    It does if the newer half is beyond the older one in width and height: limbs and wings change one, to and fro.
+    """
+    half = len(boxes) // 2
+    if half < 3:
+        return boxes
+    older, newer = (list(zip(*part, strict=True)) for part in (boxes[:half], boxes[half:]))  # widths, and heights
+    sides = list(zip(older, map(statistics.median, newer), strict=True))
+    grows, shrinks = all(now > max(was) for was, now in sides), all(now < min(was) for was, now in sides)
+    return boxes[-(len(boxes) // 3) :] if grows or shrinks else boxes
 
 
 class Trail:
@@ -232,7 +259,8 @@ class TrackingSettings:
         process_noise: spectral density of the white acceleration in the image [px^2/s^3].
         noise_px: standard deviation of a detection's centre, the part independent of its size [px].
         noise_of_size: the part proportional to the box's side, from moving limbs and wings.
-        speed_px: standard deviation of a new track's speed [px/s].
+        speed_px: least standard deviation of a new track's speed [px/s].
+        speed_sides: that deviation in larger sides of its box [1/s]: what is nearer is larger and faster.
         confirm_hits: fewest detections of a confirmed track.
         confirm_travel: least travel of a confirmed track, in larger sides of its box; 0 if it may stand still.
         least_travel: least travel of a confirmed track, in parts of the image's width.
@@ -244,6 +272,7 @@ class TrackingSettings:
         lose_s: time without a detection after which a confirmed track ends [s]; its age if that is less.
         drop_s: time without a detection after which an unconfirmed track ends [s].
         size_s: window of the size's median and maximum, some two wing beats [s].
+        trend: whether the size follows a target that grows or shrinks. Wings look as if it did.
         gate: gate on the squared Mahalanobis distance of place and size, 99.9 % of a chi-square with three degrees of
             freedom.
         size_sigma: standard deviation of the logarithm of a box's side: wings, limbs and occluders make it half or
@@ -264,6 +293,7 @@ class TrackingSettings:
     noise_px: float = 0.4
     noise_of_size: float = 0.06
     speed_px: float = 120.0
+    speed_sides: float = 3.0
     confirm_hits: int = 4
     confirm_travel: float = 0.0
     least_travel: float = 0.0
@@ -274,6 +304,7 @@ class TrackingSettings:
     lose_s: float = 0.8
     drop_s: float = 0.13
     size_s: float = 0.6
+    trend: bool = True
     gate: float = 16.3
     size_sigma: float = 0.5
     newcomers_hz: float = 2.0
@@ -295,7 +326,7 @@ class TrackingSettings:
 BY_MOTION: Mapping[str, Mapping[str, float]] = {
     "standing": {"noise_of_size": 0.04},
     "walking": {"noise_of_size": 0.04},
-    "flying": {"noise_of_size": 0.2, "process_noise": 18750.0},
+    "flying": {"noise_of_size": 0.2, "process_noise": 18750.0, "trend": False},
     "general": {},
 }
 BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
@@ -379,14 +410,13 @@ class LiveTrack:
         self.after_cut = False  # whether the film was cut since the last detection
         self._image_size = image_size
         self.mean_score = 0.0
-        self._sizes = SizeHistory(settings.size_s)
+        self._sizes = SizeHistory(settings.size_s, settings.trend)
         # Travel is needed until the track is confirmed, and only if the settings ask for it.
         self._trail = Trail(settings.travel_s, image_size) if settings.confirm_travel else None
         self._add_box(detection)
-        self._axes = [
-            AxisFilter(at, variance, settings.speed_px**2)
-            for at, variance in zip(detection.center_px.tolist(), self.variance(detection), strict=True)
-        ]
+        self._first = self._edges(detection)
+        self._whole = not detection.clipped  # whether any box was not clipped
+        self._axes = self._begin(detection)
 
     @property
     def center(self) -> tuple[float, float]:
@@ -413,8 +443,11 @@ class LiveTrack:
 
     def move(self, by: Array) -> None:
         """Move with the scene, by (du, dv) [px], because the camera has turned."""
+        if not by.any():
+            return
         for axis, shift in zip(self._axes, by.tolist(), strict=True):
             axis.position += shift
+        self._first = [(low + shift, high + shift) for (low, high), shift in zip(self._first, by.tolist(), strict=True)]
         if self._trail is not None:
             self._trail.move(by)
 
@@ -422,6 +455,9 @@ class LiveTrack:
         """Correct with a detection of this track alone."""
         weight = 1 - math.exp(-(self.t - self.seen) / self.settings.score_s)
         self.mean_score += weight * (detection.score - self.mean_score)
+        if not self._whole:
+            self._axes = self._begin(detection)
+            self._whole = not detection.clipped
         self._measure(detection.center_px.tolist(), self.variance(detection))
         self._add_box(detection)
         self.detection, self.shared = detection, False
@@ -496,6 +532,27 @@ class LiveTrack:
         for history in (self._sizes, self._trail):
             if history is not None:
                 history.add(self.t, (u, v), (width, height), detection.clipped)
+
+    def _begin(self, detection: Measurement) -> list[AxisFilter]:
+        """Make filters that begin at a box, with the velocity of the edges in view since the first box.
+
+        The centre of a target that comes into view is unknown, and that of its clipped box moves half as fast.
+        """
+        settings, center, size = self.settings, detection.center_px.tolist(), detection.size_px.tolist()
+        speed, dt = max(settings.speed_px, settings.speed_sides * max(size)), self.t - self.born
+        axes = [AxisFilter(at, var, speed**2) for at, var in zip(center, self.variance(detection), strict=True)]
+        for axis, side, first, now in zip(axes, size, self._first, self._edges(detection), strict=True):
+            ways = [after - before for before, after in zip(first, now, strict=True) if not math.isnan(after - before)]
+            if ways and dt > 0:
+                noise = center_variance(settings, side, settings.noise_of_size, 0.0)
+                axis.correct_velocity(statistics.fmean(ways) / dt, 2 * noise / dt**2)
+        return axes
+
+    def _edges(self, detection: Measurement) -> list[Edges]:
+        """Edges of a box along u and v, see `_edges`."""
+        extents = self._image_size or (None, None)
+        sides = zip(detection.center_px.tolist(), detection.size_px.tolist(), extents, strict=True)
+        return [_edges(center, size, extent, detection.clipped) for center, size, extent in sides]
 
     def _has_evidence(self) -> bool:
         """Whether the score shows a target, or the travel together with half that score."""

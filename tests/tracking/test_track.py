@@ -61,3 +61,13 @@ def test_sizes_are_those_that_the_border_does_not_cut():
     whole = filled(SizeHistory(0.5), boxes, {0, 1})
     np.testing.assert_allclose(whole.size, [31, 62])
     assert whole.larger_side == pytest.approx(60 + 0.9 * 4)
+
+
+def test_the_size_of_a_target_that_drives_away_follows_it():
+    """A car becomes smaller by a third in 0.3 s; a person's stride or a bird's wings change one side, to and fro."""
+    car = [[0, 0, 160 * 0.96**i, 120 * 0.96**i] for i in range(30)]
+    size = np.array([160, 120]) * 0.96**29
+    np.testing.assert_allclose(filled(SizeHistory(0.6, trend=True), car).size, size, rtol=0.1)
+    assert filled(SizeHistory(0.6), car).size[0] > 1.3 * size[0]
+    stride = [[0, 0, 40 + 15 * np.sin(2 * np.pi * 1.0 * i * DT), 120] for i in range(30)]
+    assert filled(SizeHistory(0.6, trend=True), stride).size == pytest.approx(filled(SizeHistory(0.6), stride).size)

@@ -104,6 +104,24 @@ def test_box_cut_by_the_border_does_not_shrink_the_target():
     assert track.velocity_px[0] == pytest.approx(100, abs=SPEED_TOLERANCE)
 
 
+@pytest.mark.parametrize("speed", [200.0, 700.0])
+def test_a_large_target_that_comes_into_view_is_tracked_to_its_centre_as_soon_as_it_is_whole(speed):
+    """A car of 240 x 150 px at the left border, whose box is cut at first, so that its centre moves half as fast."""
+    rng, tracker, off = np.random.default_rng(3), Tracker(image_size=(640, 480)), []
+    for i in range(75):
+        center, noise = 10 + speed * i / 30 - 120, rng.normal(0, 2, 4)
+        if center > 480:
+            break
+        left, right = max(center - 120 + noise[0], -0.5), center + 120 + noise[1]
+        box = seen((left + right) / 2, 200 + noise[2], right - left, 150 + noise[3], clipped=left < 0)
+        tracks = tracker.update([box], i / 30)
+        if left > 0:
+            off.append(tracks[0].center_px - (center, 200.0))
+    assert {track.id for track in tracks} == {1}
+    assert len(off) >= 10
+    assert np.abs(off).max() < 12
+
+
 @pytest.mark.parametrize("twigs", [1, 2])
 def test_piece_of_a_target_does_not_bend_its_way(twigs):
     """In front of a tree only a wing's tip is seen: it shows that the target is there, and not where its centre is."""
