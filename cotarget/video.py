@@ -132,7 +132,7 @@ def _quarter_turns(path: Path) -> int:
     """Quarter turns to the left by which players show a film, as one taken with an upright phone; 0 if unknown."""
     if not path.is_file():  # a pipe is read once
         return 0
-    with contextlib.suppress(av.error.FFmpegError, OSError), av.open(_url(path)) as container:
+    with contextlib.suppress(av.error.FFmpegError, OSError), contextlib.closing(av.open(_url(path))) as container:
         for picture in container.decode(video=0):
             return round(picture.rotation / 90) % 4
     return 0

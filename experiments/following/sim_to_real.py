@@ -418,7 +418,7 @@ def _figures(ways: Mapping[str, Sequence[Row]]) -> dict[str, float]:
     boxes = {way: sum(row["boxes"] for row in rows) for way, rows in ways.items()}
     recall = {f"recall {way}": sum(row["found"] for row in rows) / boxes[way] for way, rows in ways.items()}
     error = {f"error_px {way}": _error(rows) for way, rows in ways.items()}
-    return {"boxes": next(iter(boxes.values())), **recall, **error}
+    return {"frames": next(iter(boxes.values())), **recall, **error}
 
 
 def _error(rows: Sequence[Row]) -> float:
@@ -432,7 +432,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     far = []
     for name, kinds in summary.items():
         pair = [kinds[kind] for kind in ("simulation", "fitted") if kind in kinds]
-        if len(pair) < 2 or min(each["boxes"] for each in pair) < LEAST_BOXES:
+        if len(pair) < 2 or min(each["frames"] for each in pair) < LEAST_BOXES:
             continue
         for way, most in RECALL_WITHIN.items():
             for figure, within in ((f"recall {way}", most), (f"error_px {way}", ERROR_WITHIN_PX)):
@@ -449,7 +449,7 @@ def plot(rows: Sequence[Row], figure: "Figure") -> None:
         for kind in ("simulation", "composite"):
             both = [each for each in summary.values() if kind in each and "fitted" in each]
             recalls = [[each[of][f"recall {way}"] for each in both] for of in ("fitted", kind)]
-            axes.scatter(*recalls, [max(3.0, min(each[kind]["boxes"], 300) / 5) for each in both], label=kind)
+            axes.scatter(*recalls, [max(3.0, min(each[kind]["frames"], 300) / 5) for each in both], label=kind)
         axes.plot([0, 1], [0, 1], "k:")
         axes.set(title=way, xlabel="recall in film, fitted boxes", ylabel="recall")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
