@@ -2,8 +2,7 @@
 
 The weights of `cotarget.detection.small_target.small_target_score` are fitted to four fifths of the labelled films of
 `experiments.following.films`. The others are searched with these weights, with those fitted to all films, and with the
-usual ones. Films that follow each other by name are in one fifth, because they often show one place and day, and one
-kind of flyer.
+usual ones. Films of one place and day are in one fifth; `film_places.csv` lists them, by their backgrounds.
 
 A region that the detector examines in a labelled frame is a target if it is on a label. Logistic regression takes
 targets and others as equally likely in every film.
@@ -22,6 +21,7 @@ from scipy.special import expit, xlogy
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import AutoDetector, SmallTargetDetector
 from cotarget.detection.small_target import WEIGHTS, Weights, evidence
+from cotarget.files import read_table
 from cotarget.geometry import Array
 from cotarget.track_metrics import LEARNING_FRAMES, Box, Criterion
 from cotarget.tracking.track import tracking_settings
@@ -33,6 +33,7 @@ from experiments.tables import grouped
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+PLACES = Path(__file__).with_name("film_places.csv")
 FOLDS = 5
 WITHIN = 0.01  # of the recall with weights fitted to all films
 USUAL, ALL, OTHERS = "usual weights", "fitted to all films", "fitted to the other films"
@@ -61,14 +62,26 @@ def jobs(settings: ScoreFoldsSettings) -> Sequence[int]:
 def one(settings: ScoreFoldsSettings, number: int) -> list[Row]:
     """Fit the weights with and without a fifth of the films, and search these; give a row for each film and weights."""
     found, regions = _films_and_regions(settings)
-    held_out = np.array_split(np.arange(len(found)), FOLDS)[number]
+    held_out = folds([video.stem for video, _ in found])[number]
     others = [each for i, each in enumerate(regions) if i not in held_out]
     ways = {USUAL: WEIGHTS, ALL: fit(regions), OTHERS: fit(others)}
     rows = []
-    for i in held_out.tolist():
+    for i in held_out:
         film = labelled_film(*found[i])
         rows += [{"seed": number, **_searched(film, name, weights)} for name, weights in ways.items()]
     return rows
+
+
+def folds(names: Sequence[str]) -> list[list[int]]:
+    """Divide films into fifths of about as many, those of one place in one; give their indices in each."""
+    place = {row["film"]: row["place"] for row in read_table(PLACES, {"film": str, "place": str}, "places of films")}
+    places: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        places.setdefault(place.get(name, name), []).append(i)
+    found: list[list[int]] = [[] for _ in range(FOLDS)]
+    for together in sorted(places.values(), key=len, reverse=True):
+        min(found, key=len).extend(together)
+    return found
 
 
 @functools.cache

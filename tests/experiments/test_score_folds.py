@@ -6,7 +6,7 @@ import pytest
 from cotarget.rig import Frame
 from cotarget.track_metrics import Box, Label
 from experiments.following.films import LabelledFilm
-from experiments.following.score_folds import ALL, OTHERS, examined, fit, missed, summarise
+from experiments.following.score_folds import ALL, OTHERS, examined, fit, folds, missed, summarise
 
 RATE = 25.0
 
@@ -22,6 +22,15 @@ def test_targets_and_others_are_equally_likely_in_every_film():
 
     weights = fit([film(1000, 20000), film(20000, 2000), (np.ones((5, 3)), np.ones(5, bool))])
     assert weights == pytest.approx((2, 2, 2, 0), abs=0.25)
+
+
+def test_films_of_one_place_are_in_one_fold():
+    names = ["V_BIRD_006", "V_BIRD_007", "V_BIRD_002", "V_DRONE_008", "V_BIRD_021", "V_BIRD_022", "one", "two"]
+    found = folds(names)
+    assert sorted(i for fold in found for i in fold) == list(range(8))
+    assert sorted(len(fold) for fold in found) == [1, 1, 2, 2, 2]
+    for one, other in ((0, 1), (2, 3), (4, 5)):
+        assert any(one in fold and other in fold for fold in found)
 
 
 def test_regions_on_labels_are_targets_and_those_on_other_flyers_are_left_out():
