@@ -249,7 +249,7 @@ NEEDED = {
     "colour": "what --target names has to look like its template",
     "motion": "what --target names has to move",
     "mog2": "what --target names has to move",
-    "speck": "what --target names has to move",
+    "speck": "what --target names has to move or beat its wings",
     "onnx": "what --target names has to be of network.classes, with a score of network.least_score",
 }
 
