@@ -645,9 +645,8 @@ def parse_config(table: Mapping[str, Any], folder: Path | None = None) -> RigCon
     given = table.pop("targets", {})
     if not isinstance(given, Mapping):
         raise ConfigError(f"targets: {given!r} is not a table")
-    for name, values in sorted(
-        given.items(), key=lambda each: split_name(each[0])[0] != each[0]
-    ):  # "car" before "car2"
+    # A kind before its numbered targets, which have its settings.
+    for name, values in sorted(given.items(), key=lambda each: split_name(each[0])[1] > 1):
         base = _of_kind(targets, name)
         target = validate(TargetProfile, values, f"targets.{name}", base=base, folder=folder)
         if (target.detector == "onnx") != (target.network is not None):
