@@ -455,10 +455,12 @@ class LiveTrack:
         """Correct with a detection of this track alone."""
         weight = 1 - math.exp(-(self.t - self.seen) / self.settings.score_s)
         self.mean_score += weight * (detection.score - self.mean_score)
-        if not self._whole:
+        if self._whole:
+            self._measure(detection.center_px.tolist(), self.variance(detection))
+        else:
             self._axes = self._begin(detection)
             self._whole = not detection.clipped
-        self._measure(detection.center_px.tolist(), self.variance(detection))
+        self._found()
         self._add_box(detection)
         self.detection, self.shared = detection, False
         self.hits += 1
@@ -472,6 +474,7 @@ class LiveTrack:
         room = room_inside(detection.size_px, self.size)
         inside = np.clip(self.center, detection.center_px - room, detection.center_px + room)
         self._measure(inside.tolist(), ((self.size / 4) ** 2 + room**2).tolist())
+        self._found()
         self.detection, self.shared = detection, True
 
     @property
@@ -570,6 +573,9 @@ class LiveTrack:
         """Correct with a measured centre [px] and its variances [px^2], (2,) each."""
         for axis, at, var in zip(self._axes, center, variance, strict=True):
             axis.correct(at, var)
+
+    def _found(self) -> None:
+        """Note that this frame has a detection."""
         self.seen = self.t
         self.missed = 0
         self.after_cut = False

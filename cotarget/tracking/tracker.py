@@ -173,14 +173,16 @@ class Tracker:
         return [detections[j] for j in sorted(np.argsort(distance, kind="stable")[:most].tolist())]
 
     def _start_tracks(self, detections: Sequence[Measurement], t: float) -> None:
-        """Start a track at each detection that does not cover an existing one."""
+        """Start a track at each detection that does not cover an existing one, but for a much smaller one just found."""
         if not detections:
             return
         covered = self._settings.covered
         at, size = _boxes_of(self._tracks)
         center, extent = _boxes(detections)
         shared = intersection_areas(at, size, center, extent)
-        free = np.all(shared <= covered * _area(size)[:, None], axis=0)
+        found = np.array([not (state.missed or state.shared) for state in self._tracks], dtype=bool)
+        other = found[:, None] & (PART_AREA * _area(size)[:, None] < _area(extent))
+        free = np.all((shared <= covered * _area(size)[:, None]) | other, axis=0)
         confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
         near = intersection_areas(at[confirmed], NEAR * size[confirmed], center, extent)
         free &= np.all(near <= PART * _area(extent), axis=0)

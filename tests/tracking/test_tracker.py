@@ -122,6 +122,14 @@ def test_a_large_target_that_comes_into_view_is_tracked_to_its_centre_as_soon_as
     assert np.abs(off).max() < 12
 
 
+def test_a_target_that_was_never_whole_is_as_uncertain_as_its_last_box():
+    """Whose hidden part may be as large as the other: half its side, one standard deviation."""
+    tracker = Tracker(PLAIN, SIZE)
+    for i in range(5):
+        (track,) = tracker.update([seen(10 + i, 100, 20 + 2 * i, 40, clipped=True)], i / RATE)
+    assert np.sqrt(track.covariance[[0, 1], [0, 1]]) == pytest.approx([14, 20], rel=0.01)
+
+
 @pytest.mark.parametrize("twigs", [1, 2])
 def test_piece_of_a_target_does_not_bend_its_way(twigs):
     """In front of a tree only a wing's tip is seen: it shows that the target is there, and not where its centre is."""
@@ -317,6 +325,17 @@ def test_a_camera_that_turns_does_not_make_a_bird_part_of_the_cloud_behind_it():
         bird, cloud = seen(450 + shift[0], 200, 12, 6), seen(300 + 4 * min(i, 25) + shift[0], 200, 150, 80)
         tracks = tracker.update([bird, cloud], i / RATE, shift)
     assert [track.size_px[0] for track in tracks] == [12.0, 150.0]
+
+
+@pytest.mark.parametrize("found", [True, False], ids=["parts found", "parts hidden"])
+def test_a_car_whose_parts_were_followed_first_is_followed_as_soon_as_it_is_seen_as_a_whole(found):
+    """As after a change of light, which hides all but bumper and window; a box that replaces them is their merger."""
+    tracker = Tracker(PLAIN, SIZE)
+    for i in range(40):
+        parts = [seen(200 + 4 * i, 300, 8, 30), seen(380 + 4 * i, 300, 8, 30)]
+        whole = [seen(290 + 4 * i, 310, 300, 110)]
+        tracks = tracker.update(parts if i < 25 else [*parts, *whole] if found else whole, i / RATE)
+    assert any(track.confirmed and track.size_px[0] == 300 for track in tracks) == found
 
 
 def test_shared_detection_is_marked_as_such():
