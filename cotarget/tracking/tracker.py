@@ -173,7 +173,7 @@ class Tracker:
         return [detections[j] for j in sorted(np.argsort(distance, kind="stable")[:most].tolist())]
 
     def _start_tracks(self, detections: Sequence[Measurement], t: float) -> None:
-    """Start a track at each detection that covers no existing one, but for much smaller ones just found."""
+        """Start a track at each detection that covers no existing one, but for much smaller ones just found."""
         if not detections:
             return
         covered = self._settings.covered
