@@ -209,11 +209,12 @@ class BackgroundDetector:
             factor *= 2
         shift = self.shift / factor
         image = moved(image, -shift)
-        mask = self._subtract(image, frame.t, factor)
+        held = self._held(factor)
+        mask = self._subtract(image, frame.t, held)
         if self._settings.shadows:
             mask = cv2.threshold(mask, FOREGROUND - 1, FOREGROUND, cv2.THRESH_BINARY)[1]
         if self._settings.brightest > 1.0:
-            mask = self._unlit(mask, image)
+            mask = self._unlit(mask, image, held)
         if self._settings.sway_px:
             mask = _outside(mask, image, self._sway())
         if self._settings.opening_px:
@@ -244,22 +245,28 @@ class BackgroundDetector:
             if not self._settings.edged or self._has_edge(image, mask, _rows_and_columns(each))
         ]
 
-    def _subtract(self, image: Image, t: float, factor: int) -> Image:
+    def _held(self, factor: int) -> list[tuple[slice, slice]]:
+        """Give the parts of the reduced image whose background is not learnt."""
+        boxes = []
+        for center, size in self.held:
+            (left, top), (right, bottom) = (
+                np.maximum(np.rint((center - self.shift + sign * size / 2) / factor), 0).astype(int).tolist()
+                for sign in (-1, 1)
+            )
+            boxes.append((slice(top, bottom + 1), slice(left, right + 1)))
+        return boxes
+
+    def _subtract(self, image: Image, t: float, held: Sequence[tuple[slice, slice]]) -> Image:
         """Find the foreground at time ``t`` [s], and learn the background but for what is held."""
-        if not self.held or not self._learnt:
+        if not held or not self._learnt:
             return np.asarray(self._model.apply(image, learningRate=self._rate(t)))
         mask = np.asarray(self._model.apply(image, learningRate=0))
         if self._t is None or not 0 <= t - self._t < LEARNING_INTERVAL_S:
-            held = np.zeros(mask.shape, np.uint8)
-            for center, size in self.held:
-                (left, top), (right, bottom) = (
-                    np.maximum(np.rint((center - self.shift + sign * size / 2) / factor), 0).astype(int).tolist()
-                    for sign in (-1, 1)
-                )
-                box = slice(top, bottom + 1), slice(left, right + 1)
+            kept = np.zeros(mask.shape, np.uint8)
+            for box in held:
                 if not self._is_ghost(image, mask, box):
-                    held[box] = FOREGROUND
-            self._model.apply(image, knownForegroundMask=held, learningRate=self._rate(t))
+                    kept[box] = FOREGROUND
+            self._model.apply(image, knownForegroundMask=kept, learningRate=self._rate(t))
         return mask
 
     def _is_ghost(self, image: Image, mask: Image, box: tuple[slice, slice]) -> bool:
@@ -314,9 +321,12 @@ class BackgroundDetector:
             known = self._known = self._model.getBackgroundImage(), learnt
         return known[0]
 
-    def _unlit(self, mask: Image, image: Image) -> Image:
-        """Remove background in a brighter light from a mask, if that explains most of it."""
-        if cv2.countNonZero(mask) < FEW * mask.size:
+    def _unlit(self, mask: Image, image: Image, held: Sequence[tuple[slice, slice]]) -> Image:
+        """Remove background in a brighter light from a mask, if that explains most of it outside of what is held."""
+        free = mask.copy()
+        for box in held:
+            free[box] = 0
+        if cv2.countNonZero(free) < FEW * mask.size:
             return mask
         there = np.flatnonzero(mask != 0)
         now, before = (each.reshape(-1, 3)[there].astype(np.float32) for each in (image, self._background()))
@@ -326,7 +336,8 @@ class BackgroundDetector:
             & (light > 1.0)
             & (light < self._settings.brightest)
         )
-        if 2 * np.count_nonzero(same) > len(there):
+        is_free = free.ravel()[there] != 0
+        if 2 * np.count_nonzero(same & is_free) > np.count_nonzero(is_free):
             mask.ravel()[there[same]] = 0
         return mask
 

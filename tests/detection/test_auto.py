@@ -248,6 +248,22 @@ def test_the_place_that_a_target_has_left_is_no_target():
     assert not any(on(each, (129.5, 311.5), 20) for each in tracks[75:])
 
 
+def test_sunlight_on_the_ground_beside_a_large_target_is_no_part_of_it():
+    """The lit strip is smaller than the car that drives along it."""
+    rng, rate, size = np.random.default_rng(2), 25.0, (220, 140)
+    background, surface = scenery((640, 480), rng), texture(*size, rng)
+    places = [None] * 10 + [(40 + 3 * i, 300) for i in range(120)]
+    pictures = []
+    for i, place in enumerate(places):
+        lit = background.copy()
+        lit[380:430] *= 1 + 0.3 * np.clip((i - 60) / 20, 0, 1)
+        pictures.extend(moved(lit, surface, [place]))
+    tracks = follow(pictures, rate, rng)[60:]
+    right = [on(each, np.add(place, [109.5, 69.5]), 10) for each, place in zip(tracks, places[60:], strict=True)]
+    assert np.mean([bool(each) for each in right]) >= FOUND
+    assert np.ptp([each[0].size_px for each in right if each], axis=0).max() < 20
+
+
 @pytest.mark.parametrize("soft", [True, False], ids=["cloud", "balloon"])
 def test_a_cloud_that_drifts_is_no_target(soft):
     """Both are some 50 px large and 30 grey levels brighter than the sky."""
