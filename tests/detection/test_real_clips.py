@@ -14,9 +14,10 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detect_video import run_on_film
-from cotarget.track_metrics import Label, read_labels, read_tracks, score_tracks
+from cotarget.track_metrics import Criterion, Label, read_labels, read_tracks, score_tracks
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+VTEST_LABELS = Path(__file__).resolve().parents[1] / "data" / "vtest.txt"
 LEAST_COVERAGE = 0.95
 MOST_NUMBERS = 2
 MOST_FALSE_PER_MINUTE = 3.0
@@ -81,6 +82,32 @@ def test_a_real_bird_is_followed_as_a_speck(clip, tmp_path):
     assert result.on_target_ratio >= LEAST_COVERAGE
     assert result.numbers <= MOST_NUMBERS
     assert result.false_tracks == 0  # one in these 43 s would be more than one a minute
+
+
+@pytest.mark.parametrize("clip", ["V_BIRD_036", pytest.param("V_BIRD_034", marks=pytest.mark.slow)])
+def test_a_real_bird_is_followed_by_the_detector_for_any_kind(clip, tmp_path):
+    result = watch(clip, "auto", tmp_path)
+    assert result.on_target_ratio >= LEAST_COVERAGE
+    assert result.numbers == 1
+    assert result.false_tracks == 0
+
+
+@pytest.mark.slow
+def test_people_are_boxed_by_the_detector_for_any_kind(tmp_path):
+    """Labelled by hand: in 60 frames, everybody who is at least half visible."""
+    target = dataclasses.replace(DEFAULT_TARGETS["person"], detector="auto")
+    summary = run_on_film(need(DATA / "people" / "vtest.avi"), target, tmp_path / "tracks.csv")
+    labels, tracks = read_labels(VTEST_LABELS), read_tracks(tmp_path / "tracks.csv")
+    by_overlap, by_center = (
+        score_tracks(tracks, labels, summary.rate_hz, summary.frames, criterion=criterion)
+        for criterion in (Criterion(iou=0.5, small_px=0.0), Criterion(small_px=np.inf))
+    )
+    for how, score in ("overlap", by_overlap), ("centre", by_center):
+        print(f"vtest, auto, by {how}: recall {score.recall:.3f}, precision {score.precision:.3f}")
+    assert by_overlap.recall >= 0.8
+    assert by_overlap.precision >= 0.78
+    assert by_center.recall >= 0.85
+    assert by_center.precision >= 0.92
 
 
 @pytest.mark.slow
