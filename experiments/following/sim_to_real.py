@@ -1,12 +1,15 @@
 """How far the simulation is from film: recall and centre error of detectors in both, by stratum.
 
-"auto", MOG2 and KNN, with one tracker and one setting each, run on four kinds of film:
+"auto", MOG2 and KNN, with one tracker and one setting each, run on three kinds of film, two of them with two kinds of
+boxes:
 
 - real: the labelled films of `experiments.following.films`;
 - fitted: the same, with a tight box around what contrasts in each label, because published boxes are up to seven times
   as large as the target; a label in which nothing contrasts is dropped;
 - composite: the same films with made flyers drawn far from the labels, whose boxes are exact;
-- simulation: five simulated birds in the field of `experiments.following.field_scenes`, with true boxes.
+- simulation: five simulated birds in the field of `experiments.following.field_scenes`, with true boxes;
+- simulation, fitted: the same with boxes that are fitted as those of the films, for a true box has wing tips too faint
+  to be seen.
 
 Each labelled box belongs to a stratum by its size, contrast, speed and background. Tracks and labels are matched one to
 one, from frame 30 on, see `cotarget.track_metrics`.
@@ -42,7 +45,8 @@ if TYPE_CHECKING:
 Labels = dict[int, list[Label]]  # by frame number
 DETECTOR: DetectorName = "auto"
 WAYS = (DETECTOR, *films.MIXTURES)
-KINDS = ("real", "fitted", "composite", "simulation")
+KINDS = ("real", "fitted", "composite", "simulation", "simulation, fitted")
+FITTED = {"real": "fitted", "simulation": "simulation, fitted"}  # kinds of film with fitted boxes, and their names
 # The usual setting of the mixtures: threshold of MOG2 [variances] and smallest area of a component [px].
 THRESHOLD, AREA_PX = 16.0, 16
 
@@ -114,8 +118,8 @@ def one(settings: SimToRealSettings, number: int) -> list[Row]:
     tracks = _tracks(clip)
     greys = [np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8) for frame in clip.frames]
     labels = {kind: clip.labels}
-    if kind == "real":
-        labels["fitted"] = fitted_labels(greys, clip.labels)
+    if kind in FITTED:
+        labels[FITTED[kind]] = fitted_labels(greys, clip.labels)
     return [
         {"seed": number, "film": film, "kind": kind, "detector": way, **row}
         for kind, boxes in labels.items()
