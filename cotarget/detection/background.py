@@ -209,7 +209,7 @@ class BackgroundDetector:
             factor *= 2
         shift = self.shift / factor
         image = moved(image, -shift)
-        held = self._held(factor)
+        held = self._held_boxes(factor)
         mask = self._subtract(image, frame.t, held)
         if self._settings.shadows:
             mask = cv2.threshold(mask, FOREGROUND - 1, FOREGROUND, cv2.THRESH_BINARY)[1]
@@ -245,7 +245,7 @@ class BackgroundDetector:
             if not self._settings.edged or self._has_edge(image, mask, _rows_and_columns(each))
         ]
 
-    def _held(self, factor: int) -> list[tuple[slice, slice]]:
+    def _held_boxes(self, factor: int) -> list[tuple[slice, slice]]:
         """Give the parts of the reduced image whose background is not learnt."""
         boxes = []
         for center, size in self.held:
