@@ -398,6 +398,7 @@ def test_labels_of_a_larger_film_are_refused_before_the_search(folder, capsys):
     ("tables", (), "one.mp4: has no labels; give"),
     ("films/one.csv", (), "--labels: .*one.csv is no folder"),
     ("films", ("--video", "drawn.mp4"), "--video: draws the tracks of one video"),
+    ("films", ("--sheet", "sheet.jpg"), "--sheet: sheet.jpg: a PNG is written; name a .png"),
     ("films", ("--csv", "none"), "--csv: none is no folder"),
 ])  # fmt: skip
 def test_a_folder_that_cannot_be_scored_is_refused(folder, capsys, labels, more, named):

@@ -306,14 +306,14 @@ def _add_inspection(command: Command) -> None:
     view.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")
 
     detect = command("detect", running.detect_command, "run the fixed camera's detector and tracker on any video")
-    _add_file(detect, "film", "video to search, or a folder of videos", "VIDEO")
+    _add_file(detect, "film", "video to search, or with --labels a folder of videos", "VIDEO")
     about = "a target of rig.toml, or one of book, person, bird"
     detect.add_argument("--target", required=True, metavar="NAME", help=about)
     about = "search with this detector (that of the target)"
     detect.add_argument("--detector", choices=("auto", "mog2", "motion", "speck"), help=about)
     about = (
         "write one line per confirmed track and frame, to stdout with -: u_px and v_px are the box's centre, the score "
-        "is 0 where the box is only predicted; for a folder of videos, the folder for their tables"
+        "is 0 where the box is only predicted; for a folder of videos, an existing folder for their tables"
     )
     _add_file(detect, "--csv", about, required=True)
     _add_file(detect, "--video", "write the video with the tracks drawn (.mp4)", "OUT")

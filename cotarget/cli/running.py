@@ -236,6 +236,8 @@ def _detect_in_folder(
     films = labelled_films(options.film, options.labels)
     tables = [options.csv / f"{film.stem}.csv" for film, _ in films]
     check_outputs([*tables, options.sheet], [*inputs, *(path for pair in films for path in pair)])
+    if options.sheet is not None and options.sheet.suffix.lower() != ".png":
+        raise ConfigError(f"--sheet: {options.sheet}: a PNG is written; name a .png")
     with progress_bar() as progress:
         found = run_on_folder(films, target, options.csv, options.sheet, criterion, progress)
     print_json(found)
