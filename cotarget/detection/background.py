@@ -33,7 +33,8 @@ class BackgroundSettings:
         threshold: squared distance to the background, in variances, from which a pixel is foreground.
         shadows: whether to separate shadows from the target.
         brightest: largest factor by which the background may brighten, as when the sun comes out, and stay background,
-            if that explains most of the foreground; the mixture knows shadows but no light. 1 for none.
+            if that explains most of the foreground beside held targets; the mixture knows shadows but no light. 1 for
+            none.
         sway_px: distance by which the background sways [px]: a pixel is background if its colour lies between the
             darkest and the brightest background colour within this distance; 0 for a rigid background.
         opening_px: foreground thinner than this is removed; 0 for none.
@@ -82,6 +83,8 @@ SOFT_PX, CONTRAST_PART, SLOPE_PART = 4.0, 0.9, 0.98
 GHOST = 0.7
 # Part of foreground pixels up to which it is faster to process them one by one than the whole image.
 FEW = 0.01
+# Part of what is held from which light explains it, so that it is no target but lit ground.
+LIT = 0.8
 # Margin beside the background's range [grey levels]: five standard deviations of a sensor's noise of 2, and coding.
 MARGIN = 15
 # A component wider than the first part of its height may be a target and something flat. What is left of it without the
@@ -322,11 +325,8 @@ class BackgroundDetector:
         return known[0]
 
     def _unlit(self, mask: Image, image: Image, held: Sequence[tuple[slice, slice]]) -> Image:
-        """Remove background in a brighter light from a mask, if that explains most of it outside of what is held."""
-        free = mask.copy()
-        for box in held:
-            free[box] = 0
-        if cv2.countNonZero(free) < FEW * mask.size:
+        """Remove background in a brighter light from a mask, if that explains most of it outside of held targets."""
+        if cv2.countNonZero(mask) < FEW * mask.size:
             return mask
         there = np.flatnonzero(mask != 0)
         now, before = (each.reshape(-1, 3)[there].astype(np.float32) for each in (image, self._background()))
@@ -336,9 +336,14 @@ class BackgroundDetector:
             & (light > 1.0)
             & (light < self._settings.brightest)
         )
-        is_free = free.ravel()[there] != 0
-        if 2 * np.count_nonzero(same & is_free) > np.count_nonzero(is_free):
-            mask.ravel()[there[same]] = 0
+        lit, free = np.zeros_like(mask), mask.copy()
+        lit.ravel()[there[same]] = FOREGROUND
+        for box in held:
+            if cv2.countNonZero(lit[box]) < LIT * cv2.countNonZero(mask[box]):
+                free[box] = 0
+        count = cv2.countNonZero(free)
+        if count >= FEW * mask.size and 2 * cv2.countNonZero(cv2.bitwise_and(free, lit)) > count:
+            mask[lit != 0] = 0
         return mask
 
     def _sway(self) -> tuple[Image, Image]:

@@ -284,7 +284,7 @@ class TrackingSettings:
         overlap_enough: overlap from which a box may belong to a track even outside the gate: the target merged with
             something else.
         covered: a detection that covers this part of a track's predicted box explains the track, even if another has
-            won it.
+            won it, but not if it is much larger and the track has just been found.
         most_detections: most detections of a frame that are used: snow, rain or flicker must not delay the next frame.
             Real films of birds and of a dozen people have up to 10.
     """

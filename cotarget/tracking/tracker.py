@@ -30,7 +30,8 @@ IMPOSSIBLE = 1e6
 PART, NEAR = 0.5, 1.5
 # A track in the box of a larger one is a part of it, such as the hand of a person who comes into view, if both began
 # within a time [s], the areas differ by a factor, and both have moved by the larger one's smaller side with a relative
-# displacement of less than a part of that. A bird before a cloud does not move with it.
+# displacement of less than a part of that. A bird before a cloud does not move with it. With that factor of areas, a
+# box around a track begins another one, of which the first is then no part: it may also be a flock around a bird.
 PART_S, PART_AREA, APART = 0.5, 4.0, 0.25
 
 
@@ -52,6 +53,7 @@ class Tracker:
         self._next_id = 1
         # For numbers of a larger track and of one in its box: both centres when it was first there [px, in the scene].
         self._inside_since: dict[tuple[int, int], tuple[Array, Array]] = {}
+        self._around: set[tuple[int, int]] = set()  # numbers of a track that began around another, and of the other
         self._t: float | None = None
         self._shift: Array = np.zeros(2)  # of the scene in the last frame [px]
         self._interval = self._settings.lose_s  # between the last two frames [s]
@@ -149,15 +151,17 @@ class Tracker:
         for i, j in np.argwhere(inside).tolist():
             whole, part = confirmed[i], confirmed[j]
             measured = not any(state.missed or state.shared for state in (whole, part))
-            if not measured or abs(whole.born - part.born) > PART_S:
-                continue
             pair = whole.number, part.number
+            if not measured or abs(whole.born - part.born) > PART_S or pair in self._around:
+                continue
             start = inside_since[pair] = self._inside_since.get(pair, (at[i], at[j]))
             displacement, relative = at[i] - start[0], (at[i] - start[0]) - (at[j] - start[1])
             if np.hypot(*displacement) > size[i].min() and np.hypot(*relative) < APART * np.hypot(*displacement):
                 over.add(part.number)
         self._tracks = [state for state in self._tracks if state.number not in over]
         self._inside_since = inside_since
+        living = {state.number for state in self._tracks}
+        self._around = {pair for pair in self._around if living.issuperset(pair)}
 
     def _most_useful(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
         """Select at most `most_detections` detections, in their order."""
@@ -181,8 +185,10 @@ class Tracker:
         center, extent = _boxes(detections)
         shared = intersection_areas(at, size, center, extent)
         found = np.array([not (state.missed or state.shared) for state in self._tracks], dtype=bool)
+        on = shared > covered * _area(size)[:, None]
         other = found[:, None] & (PART_AREA * _area(size)[:, None] < _area(extent))
-        free = np.all((shared <= covered * _area(size)[:, None]) | other, axis=0)
+        free = np.all(~on | other, axis=0)
+        numbers = [state.number for state in self._tracks]
         confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
         near = intersection_areas(at[confirmed], NEAR * size[confirmed], center, extent)
         free &= np.all(near <= PART * _area(extent), axis=0)
@@ -190,6 +196,7 @@ class Tracker:
         for j, detection in enumerate(detections):
             if free[j]:  # detections that cover this new track are no further target
                 free &= ~covers[j]
+                self._around |= {(self._next_id, numbers[i]) for i in np.flatnonzero(on[:, j])}
                 self._tracks.append(LiveTrack(self._next_id, detection, t, self._settings, self._image_size))
                 self._next_id += 1
 

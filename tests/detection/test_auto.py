@@ -264,6 +264,19 @@ def test_sunlight_on_the_ground_beside_a_large_target_is_no_part_of_it():
     assert np.ptp([each[0].size_px for each in right if each], axis=0).max() < 20
 
 
+def test_a_patch_of_sunlight_that_grows_is_no_target_even_if_it_was_one_while_small():
+    rng, rate = np.random.default_rng(2), 25.0
+    background, pictures = scenery((640, 480), rng), []
+    for i in range(110):
+        picture, k = background.copy(), i - 10
+        if k >= 0:
+            picture[300 : 328 + 4 * k // 5, 60 + 3 * k : 100 + 4 * k] *= 1.3
+        pictures.append(picture)
+    tracks = follow(pictures, rate, rng)
+    assert any(tracks[:50])  # else nothing is shown
+    assert not any(tracks[100:])
+
+
 @pytest.mark.parametrize("soft", [True, False], ids=["cloud", "balloon"])
 def test_a_cloud_that_drifts_is_no_target(soft):
     """Both are some 50 px large and 30 grey levels brighter than the sky."""

@@ -335,7 +335,17 @@ def test_a_car_whose_parts_were_followed_first_is_followed_as_soon_as_it_is_seen
         parts = [seen(200 + 4 * i, 300, 8, 30), seen(380 + 4 * i, 300, 8, 30)]
         whole = [seen(290 + 4 * i, 310, 300, 110)]
         tracks = tracker.update(parts if i < 25 else [*parts, *whole] if found else whole, i / RATE)
-    assert any(track.confirmed and track.size_px[0] == 300 for track in tracks) == found
+    assert [track.size_px[0] for track in tracks if track.confirmed] == ([8, 8, 300] if found else [8, 8])
+
+
+def test_a_box_around_two_birds_for_a_while_does_not_end_their_tracks():
+    tracker = Tracker(PLAIN, SIZE)
+    for i in range(90):
+        birds = [seen(100 + 3 * i, 200, 10, 10), seen(130 + 3 * i, 200, 10, 10)]
+        around = [seen(115 + 3 * i, 200, 42, 14)] if 10 < i < 45 else []
+        tracks = tracker.update([*birds, *around], i / RATE)
+        assert i < 4 or [track.id for track in tracks if track.confirmed][:2] == [1, 2]
+    assert [track.id for track in tracks] == [1, 2]
 
 
 def test_shared_detection_is_marked_as_such():
