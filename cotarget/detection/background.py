@@ -81,7 +81,7 @@ EDGE_PX = 1
 SOFT_PX, CONTRAST_PART, SLOPE_PART = 4.0, 0.9, 0.98
 # Largest edge in the image over that in the background, where a target has left.
 GHOST = 0.7
-# Part of foreground pixels up to which it is faster to process them one by one than the whole image.
+# Part of the image up to which it is faster to process foreground pixels one by one, and too few for a change of light.
 FEW = 0.01
 # Part of what is held from which light explains it, so that it is no target but lit ground.
 LIT = 0.8

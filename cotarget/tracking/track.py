@@ -407,6 +407,7 @@ class LiveTrack:
         self.missed = 0
         self.confirmed = False
         self.is_part = False  # whether it lies in a larger confirmed track
+        self.around: set[int] = set()  # numbers of the tracks that it covered when it began
         self.after_cut = False  # whether the film was cut since the last detection
         self._image_size = image_size
         self.mean_score = 0.0

@@ -53,7 +53,6 @@ class Tracker:
         self._next_id = 1
         # For numbers of a larger track and of one in its box: both centres when it was first there [px, in the scene].
         self._inside_since: dict[tuple[int, int], tuple[Array, Array]] = {}
-        self._around: set[tuple[int, int]] = set()  # numbers of a track that began around another, and of the other
         self._t: float | None = None
         self._shift: Array = np.zeros(2)  # of the scene in the last frame [px]
         self._interval = self._settings.lose_s  # between the last two frames [s]
@@ -151,17 +150,15 @@ class Tracker:
         for i, j in np.argwhere(inside).tolist():
             whole, part = confirmed[i], confirmed[j]
             measured = not any(state.missed or state.shared for state in (whole, part))
-            pair = whole.number, part.number
-            if not measured or abs(whole.born - part.born) > PART_S or pair in self._around:
+            if not measured or abs(whole.born - part.born) > PART_S or part.number in whole.around:
                 continue
+            pair = whole.number, part.number
             start = inside_since[pair] = self._inside_since.get(pair, (at[i], at[j]))
             displacement, relative = at[i] - start[0], (at[i] - start[0]) - (at[j] - start[1])
             if np.hypot(*displacement) > size[i].min() and np.hypot(*relative) < APART * np.hypot(*displacement):
                 over.add(part.number)
         self._tracks = [state for state in self._tracks if state.number not in over]
         self._inside_since = inside_since
-        living = {state.number for state in self._tracks}
-        self._around = {pair for pair in self._around if living.issuperset(pair)}
 
     def _most_useful(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
         """Select at most `most_detections` detections, in their order."""
@@ -188,7 +185,7 @@ class Tracker:
         on = shared > covered * _area(size)[:, None]
         other = found[:, None] & (PART_AREA * _area(size)[:, None] < _area(extent))
         free = np.all(~on | other, axis=0)
-        numbers = [state.number for state in self._tracks]
+        numbers = np.array([state.number for state in self._tracks], dtype=int)
         confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
         near = intersection_areas(at[confirmed], NEAR * size[confirmed], center, extent)
         free &= np.all(near <= PART * _area(extent), axis=0)
@@ -196,8 +193,9 @@ class Tracker:
         for j, detection in enumerate(detections):
             if free[j]:  # detections that cover this new track are no further target
                 free &= ~covers[j]
-                self._around |= {(self._next_id, numbers[i]) for i in np.flatnonzero(on[:, j])}
-                self._tracks.append(LiveTrack(self._next_id, detection, t, self._settings, self._image_size))
+                new = LiveTrack(self._next_id, detection, t, self._settings, self._image_size)
+                new.around = set(numbers[on[:, j]].tolist())
+                self._tracks.append(new)
                 self._next_id += 1
 
 

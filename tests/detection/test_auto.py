@@ -333,6 +333,18 @@ def test_the_foreground_of_a_camera_that_pans_is_not_that_of_before():
     assert cv2.countNonZero(detector.mask[200:280, 200:260]) < 0.1 * 60 * 80
 
 
+def test_what_the_image_shows_is_learnt_beside_places_that_are_held_outside_of_it():
+    """A track near the border, and a camera that has been nudged: what the image shows is learnt."""
+    rng, rate = np.random.default_rng(8), 5.0
+    detector = BackgroundDetector(LARGE, rate)
+    detector.held = [(np.array([u, 130.0]), np.array([10.0, 60.0])) for u in (-300.0, 700.0)]
+    pictures = list(moved(scenery((640, 480), rng), texture(40, 60, rng), [None] * 10 + [(320, 100)] * 200))
+    found = [detector.detect(Frame(picture.astype(np.uint8), i / rate)) for i, picture in enumerate(pictures)]
+    assert len(found[12]) == 1
+    assert not found[-1]
+    assert not detector.mask.any()
+
+
 def test_a_place_that_is_held_may_lie_outside_the_image():
     """A track near the border, and a camera that has been nudged."""
     rng, rate = np.random.default_rng(8), 25.0
