@@ -31,7 +31,7 @@ from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, target_of, watched, watched_in
+from experiments.following.field import FieldSettings, calibrated, watched, watched_in
 from experiments.following.field_scenes import hold_config
 from experiments.tables import outside
 
@@ -140,7 +140,7 @@ def _beside_none(settings: SimSpeedSettings, seed: int) -> list[Row]:
 def held(calibration: Calibration, seconds: float, seed: int) -> Iterator[tuple[Step, Truth]]:
     """Follow the bird with both cameras rendered, for some seconds after SETTLED_S."""
     config = hold_config(TARGET, seed)
-    return watched(calibration, config, target_of(config, TARGET), SETTLED_S + seconds)
+    return watched(calibration, config, config.target(TARGET), SETTLED_S + seconds)
 
 
 def held_unrendered(calibration: Calibration, seconds: float, seed: int) -> Iterator[tuple[Step, Truth]]:
@@ -149,7 +149,7 @@ def held_unrendered(calibration: Calibration, seconds: float, seed: int) -> Iter
     world = SimWorld(config, rendered=())
     settings = FollowSettings(closed_loop=False)
     detector = TruthDetector(world.truth(), seed)
-    return watched_in(world, detector, calibration, target_of(config, TARGET), SETTLED_S + seconds, settings)
+    return watched_in(world, detector, calibration, config.target(TARGET), SETTLED_S + seconds, settings)
 
 
 def real_time_factor(steps: Iterable[tuple[Step, Any]]) -> float:

@@ -14,7 +14,7 @@ from cotarget.control.head import HeadSettings
 from cotarget.metrics import score
 from cotarget.pipeline import FollowSettings
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, held, target_of
+from experiments.following.field import FieldSettings, calibrated, held
 from experiments.following.field_scenes import hold_config
 from experiments.following.wide_view import record
 from experiments.tables import grouped, outside, spread
@@ -39,7 +39,7 @@ def one(settings: DeadZoneSettings, seed: int) -> list[Row]:
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
-        view = record(config, target_of(config, name), settings.seconds)
+        view = record(config, config.target(name), settings.seconds)
         for way, head in WAYS.items():
             how = FollowSettings(head=head, closed_loop=settings.closed_loop)
             found = score(held(calibrated(settings), config, name, settings.seconds, how, view))

@@ -21,7 +21,7 @@ from cotarget.metrics import score
 from cotarget.pipeline import FollowSettings
 from cotarget.schema import NotNegative
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, held, target_of
+from experiments.following.field import FieldSettings, calibrated, held
 from experiments.following.field_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
 from experiments.following.wide_view import record
 from experiments.tables import grouped, spread
@@ -53,7 +53,7 @@ def one(settings: DelaySettings, seed: int) -> list[Row]:
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
-        view = record(config, target_of(config, name), settings.seconds)
+        view = record(config, config.target(name), settings.seconds)
         for delay, predict, closed_loop in cases:
             late = delayed(config, delay)
             how = FollowSettings(predict=predict, closed_loop=closed_loop)

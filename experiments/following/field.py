@@ -3,7 +3,6 @@
 The field itself is described in `experiments.following.field_scenes`.
 """
 
-import dataclasses
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -64,7 +63,7 @@ def held(
     view: WideView | None = None,
 ) -> list[Judged]:
     """Follow a target of a simulated rig, and judge every frame; a view that is not recorded is rendered."""
-    target, rows = target_of(config, name), list[Judged]()
+    target, rows = config.target(name), list[Judged]()
     for step, truth in watched(calibration, config, target, seconds, settings, view):
         add_row(rows, step, truth, name, target)
     return rows
@@ -103,9 +102,3 @@ def watched_in(
     with guard(world.rig, world.config.safety) as rig:
         for step in how(rig, calibration, target, detector, seconds=seconds, settings=settings):
             yield step, truth
-
-
-def target_of(config: RigConfig, name: str) -> TargetProfile:
-    """Give a target's settings in the field; a bird is found by `speck`, because clutter hides it from others."""
-    target = config.target(name)
-    return dataclasses.replace(target, detector="speck") if target.motion == "flying" else target

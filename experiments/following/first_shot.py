@@ -39,7 +39,7 @@ from cotarget.targeting import Reach, aim
 from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, target_of
+from experiments.following.field import FieldSettings, calibrated
 from experiments.following.field_scenes import LATENCY_S, hold_config
 from experiments.tables import grouped, outside, rms, spread
 
@@ -74,7 +74,7 @@ def one(settings: FirstShotSettings, seed: int) -> list[Row]:
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
-        shots = fire(calibrated(settings), config, name, target_of(config, name), settings.seconds)
+        shots = fire(calibrated(settings), config, name, config.target(name), settings.seconds)
         rows += [{"seed": seed, "target": name} | row for row in shots]
     return rows
 

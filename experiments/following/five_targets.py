@@ -24,7 +24,7 @@ from cotarget.pipeline import FollowSettings
 from cotarget.sim.targets.random_paths import GROUP
 from cotarget.sim.truth import Truth
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, target_of, watched
+from experiments.following.field import FieldSettings, calibrated, watched
 from experiments.following.field_scenes import five_targets_config
 from experiments.following.wide_view import WideView, record
 from experiments.tables import BESIDE, grouped
@@ -47,7 +47,7 @@ def one(settings: FiveSettings, seed: int) -> list[Row]:
     rows: list[Row] = []
     for kind in settings.kinds:
         config = five_targets_config(seed, kind)
-        target = target_of(config, kind)
+        target = config.target(kind)
         view = record(config, target, settings.seconds)
         for policy, make in POLICIES.items():
             how = FollowSettings(closed_loop=settings.closed_loop)
