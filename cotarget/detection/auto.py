@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.detection.background import LARGE, PERSON, WIDE, BackgroundDetector
+from cotarget.detection.background import LARGE, PERSON, BackgroundDetector
 from cotarget.detection.base import Detection
 from cotarget.detection.small_target import WEIGHTS, SmallTargetDetector, Weights
 from cotarget.geometry import Array, intersection_areas
@@ -74,7 +74,7 @@ class AutoDetector:
         """
         self._shape = shape
         self._small = SmallTargetDetector(LEAST_SCORE, weights)
-        upright = shape is not None and shape < WIDE
+        upright = shape is not None and shape < LARGE.wide
         self._large = BackgroundDetector(replace(LARGE, flat=PERSON.flat) if upright else LARGE, rate_hz)
         self._clutter = Clutter()
         self._width = 0
@@ -119,7 +119,7 @@ class AutoDetector:
         large = [replace(each, score=LARGE_SCORE) for each in self._large.detect(frame)]
         outlined = [target.beside <= PLAIN for target, _ in targets]
         large = [each for each in large if each.size_px.max() >= LARGE_PART * width]
-        return self._by_shape(fuse(small, outlined, self._are_followed(small), large))
+        return self._by_shape(fuse(small, outlined, self._are_followed(small, frame.t), large))
 
     def _by_shape(self, found: Sequence[Detection]) -> list[Detection]:
         """Weigh the scores by the expected shape, if there is one, but not those of clipped boxes; best first."""
@@ -142,10 +142,13 @@ class AutoDetector:
         self._large.shift = off if np.abs(off).max() > QUIET_PART * width else np.zeros(2)
         return all(np.abs(shift - before).max() <= least for _, before in self._shifts)
 
-    def _are_followed(self, small: Sequence[Detection]) -> list[bool]:
-        """Whether a confirmed track of its size follows each small target."""
+    def _are_followed(self, small: Sequence[Detection], t: float) -> list[bool]:
+        """Whether a confirmed track of its size, predicted at time ``t`` [s], follows each small target."""
         margin = 2 * HELD_PART * self._width
-        near = _within(small, [(track.center_px, track.size_px + margin) for track in self._tracks])
+        places = [
+            (track.center_px + (t - track.t) * track.velocity_px, track.size_px + margin) for track in self._tracks
+        ]
+        near = _within(small, places)
         sides = np.log([each.size_px.max() for each in small]), np.log([each.size_px.max() for each in self._tracks])
         alike = np.abs(np.subtract.outer(*sides)) < np.log(SIDE_RATIO)
         return (near & alike).any(axis=1).tolist()

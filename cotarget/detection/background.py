@@ -45,6 +45,7 @@ class BackgroundSettings:
         largest: largest side of a target as a part of the image's.
         flat: parts of a wide component thinner than this part of its height lie on the ground, such as the edge of a
             shadow, and are no part of the target; 0 for none.
+        wide: a component wider than this part of its height may be a target and something flat.
         rim_px: thinner foreground within this distance of what the opening leaves is kept: feet and rotors.
         edged: whether a target must have a sharp edge in the image, unlike a cloud or the place that one has left.
         image_px: images are halved until they are at most this wide; 0 for never. All lengths are in pixels of the
@@ -65,6 +66,7 @@ class BackgroundSettings:
     widest: float
     largest: float
     flat: float
+    wide: float = 0.7
     rim_px: int = 0
     edged: bool = False
     image_px: int = 960
@@ -87,9 +89,9 @@ FEW = 0.01
 LIT = 0.8
 # Margin beside the background's range [grey levels]: five standard deviations of a sensor's noise of 2, and coding.
 MARGIN = 15
-# A component wider than the first part of its height may be a target and something flat. What is left of it without the
-# flat parts must be no wider than the second, unlike for example the middle of a cloud.
-WIDE, UPRIGHT = 0.7, 1.0
+# What is left of a component without its flat parts is no wider than this part of its height, unlike for example the
+# middle of a cloud.
+UPRIGHT = 1.0
 # Memory of OpenCV's default mixture, 120 frames at 30 a second [s].
 PLAIN_HISTORY_S = 4.0
 # A bird may be as small as four pixels, so nothing is opened; it casts no shadow on the sky.
@@ -138,6 +140,7 @@ LARGE = replace(
     bridge_px=(1, 9),
     smallest_px=(3, 3),
     smallest_area_px=25,
+    wide=0.6,
     rim_px=2,
     edged=True,
     image_px=480,
@@ -384,7 +387,7 @@ class BackgroundDetector:
     def _upright(self, piece: Image) -> list[tuple[int, int]]:
         """Find the column ranges of a component that stand upright, without what lies flat."""
         height, width = piece.shape
-        if not self._settings.flat or width <= WIDE * height:
+        if not self._settings.flat or width <= self._settings.wide * height:
             return [(0, width)]
         stands = cv2.morphologyEx(
             piece, cv2.MORPH_OPEN, np.ones((max(1, round(self._settings.flat * height)), 1), np.uint8)

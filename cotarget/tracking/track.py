@@ -73,6 +73,10 @@ class AxisFilter:
         self.covariance = AxisCovariance(P.position, P.cross, P.velocity - gain * P.velocity)
 
 
+# A box shows nothing of a track in it whose area is smaller by this factor: a hand, once followed, in its person's box.
+# Of a group of people, each is a larger part.
+MEMBER = 10.0
+
 # Histories of a track's size and travel
 
 # Quantile of the larger side over a wing beat that counts as its maximum, robust against one wrong frame in ten.
@@ -110,8 +114,10 @@ class SizeHistory:
         boxes.append((t, size, clipped))
         while boxes[0][0] < t - self._span_s:
             boxes.popleft()
-        # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones.
-        whole = [sides for _, sides, is_cut in boxes if not is_cut]
+        # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones. One that is far
+        # smaller than a cut one is a part that was seen first, such as a hand.
+        largest = max((math.prod(sides) for _, sides, is_cut in boxes if is_cut), default=0.0)
+        whole = [sides for _, sides, is_cut in boxes if not is_cut and MEMBER * math.prod(sides) >= largest]
         counted, middle = (whole, statistics.median) if whole else ([sides for _, sides, _ in boxes], max)
         usual = _newest(counted) if self._trend else counted
         self.size = np.array([middle(lengths) for lengths in zip(*usual, strict=True)])
@@ -144,11 +150,12 @@ class Trail:
         """
         self._span_s = span_s
         self._extents = image_size or (None, None)
-        # Time [s] and edges of each box, and the length of the step to it [px].
-        self._boxes: deque[tuple[float, tuple[Edges, Edges], float]] = deque()
+        # Time [s] and edges of each box, the length of the step to it [px], and its area [px^2]; inf for a clipped box,
+        # whose edge in view is the target's.
+        self._boxes: deque[tuple[float, tuple[Edges, Edges], float, float]] = deque()
 
     def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
-        """Add a box.
+        """Add a box, and forget whole ones that showed only a part of what it shows.
 
         Args:
             t: time of the frame [s].
@@ -157,8 +164,11 @@ class Trail:
             clipped: whether the image's border cuts the box.
         """
         across, down = (_edges(*of, clipped) for of in zip(center, size, self._extents, strict=True))
+        area = math.prod(size)
+        if any(MEMBER * box[3] < area for box in self._boxes):
+            self._boxes = deque(box for box in self._boxes if MEMBER * box[3] >= area)
         step = _common_motion([self._boxes[-1][1]], [(across, down)]) if self._boxes else 0.0
-        self._boxes.append((t, (across, down), step))
+        self._boxes.append((t, (across, down), step, math.inf if clipped else area))
         while self._boxes[0][0] < t - self._span_s:
             self._boxes.popleft()
 
@@ -166,8 +176,8 @@ class Trail:
         """Move all boxes with the scene, by (du, dv) [px]."""
         du, dv = by.tolist()
         self._boxes = deque(
-            (t, ((left + du, right + du), (top + dv, bottom + dv)), step)
-            for t, ((left, right), (top, bottom)), step in self._boxes
+            (t, ((left + du, right + du), (top + dv, bottom + dv)), step, area)
+            for t, ((left, right), (top, bottom)), step, area in self._boxes
         )
 
     def travel(self) -> float:
@@ -176,7 +186,7 @@ class Trail:
         Both edges of a moving target move the same way. A cloud or a shadow that drifts slowly behind others grows,
         shrinks and falls apart, which moves its centre, while an edge or two stay.
         """
-        _, edges, steps = zip(*self._boxes, strict=True)
+        _, edges, steps, _ = zip(*self._boxes, strict=True)
         count = max(1, min(3, len(edges) // 3))  # medians of three, because outlines flicker
         way = _common_motion(edges[:count], edges[-count:])
         longest = max(steps[1:], default=0.0)

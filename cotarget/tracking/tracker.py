@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from cotarget.geometry import Array, intersection_areas
 from cotarget.tracking.track import (
     CUT,
+    MEMBER,
     LiveTrack,
     Measurement,
     Track,
@@ -237,6 +238,7 @@ class _Pairs:
         distance: squared distance of place (Mahalanobis) and of size, in variances.
         log_volume: logarithm of the determinant of the innovation covariance.
         covered: part of the track's box that the detection covers, 0 to 1.
+        area_ratio: area of the detection over that of the track.
         settings: settings of the tracker.
         confirmed: whether each track is confirmed.
         possible: whether each detection may belong to each track.
@@ -266,6 +268,7 @@ class _Pairs:
         self.log_volume: Array = np.log(_area(spread))
         shared = intersection_areas(at, size, center, extent)
         self.covered: Array = shared / own
+        self.area_ratio: Array = other / own
         overlap = shared / (own + other - shared)
         weak = np.array([detection.score < settings.start_score for detection in detections], dtype=bool)
         clutter = np.where(weak, float(np.count_nonzero(weak)), 0.0)
@@ -273,6 +276,7 @@ class _Pairs:
         new_object |= weak & ~np.array(self.confirmed)[:, None]
         # A target whose box merged with another still overlaps its track.
         self.possible = ((self.distance <= settings.gate) & ~new_object) | (overlap > settings.overlap_enough)
+        self.possible &= ~known | (self.area_ratio < MEMBER)
 
 
 def _least_likely(states: Sequence[LiveTrack], image_size: tuple[int, int] | None, clutter: Array) -> Array:
@@ -337,7 +341,8 @@ def _merged(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
     merged: dict[int, int] = {}
     if sum(pairs.confirmed) < 2:
         return merged
-    inside = (pairs.covered > pairs.settings.covered) & np.array(pairs.confirmed)[:, None]
+    members = (pairs.covered > pairs.settings.covered) & (pairs.area_ratio < MEMBER)
+    inside = members & np.array(pairs.confirmed)[:, None]
     for j in np.flatnonzero(np.count_nonzero(inside, axis=0) > 1):
         covered = [int(i) for i in np.flatnonzero(inside[:, j]) if matches.get(int(i), j) == j]
         if len(covered) > 1:

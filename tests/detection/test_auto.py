@@ -291,6 +291,24 @@ def test_a_cloud_that_drifts_is_no_target(soft):
     assert any(tracks) != soft
 
 
+@pytest.mark.parametrize("step", [3, 14])
+def test_a_bird_that_passes_before_a_balloon_is_not_taken_for_a_part_of_it(step):
+    """A fast bird moves by more than its size from image to image."""
+    rng, rate, frames = np.random.default_rng(7), 25.0, 420 // step
+    background, pictures, birds = scenery((640, 480), rng), [], []
+    for i in range(frames):
+        picture, bird = background.copy(), np.array([150 + i * step, 100])
+        if i * step > 100:
+            cv2.ellipse(picture, (440 - i * 100 // frames, 80), (60, 50), 0, 0, 360, (60, 120, 220), -1)
+        picture[bird[1] : bird[1] + 7, bird[0] : bird[0] + 12] = 40.0
+        pictures.append(picture)
+        birds.append(np.add(bird, (5.5, 3.0)))
+    tracks = follow(pictures, rate, rng)
+    right = [on(each, bird, 6) for each, bird in zip(tracks, birds, strict=True)][frames // 3 :]
+    assert np.mean([any(not track.missed for track in each) for each in right]) >= FOUND
+    assert len({track.id for each in right for track in each}) == 1
+
+
 @pytest.mark.parametrize("size", [(60, 24), (24, 60), (80, 160)])
 def test_a_dark_target_of_one_colour_is_found_before_a_textured_wall(size):
     """The rim of a dark target is as dark as a shadow of the wall."""

@@ -348,6 +348,58 @@ def test_a_box_around_two_birds_for_a_while_does_not_end_their_tracks():
     assert [track.id for track in tracks] == [1, 2]
 
 
+def test_a_person_whose_hand_alone_was_whole_when_he_came_into_view_is_one_track():
+    """Then the border cut the boxes of his arm and of himself."""
+    tracker = Tracker(PLAIN, SIZE)
+    for i in range(60):
+        front = 630 - 4 * i
+        right = min(front + 60, 639.5)
+        height = next((height for until, height in ((6, 24), (9, 80)) if i < until), 150)
+        whole = seen((front + right) / 2, 300, right - front, height, clipped=front + 60 > 639.5)
+        tracks = tracker.update([seen(front + 6, 300, 12, 11) if i < 3 else whole], i / RATE)
+    (track,) = tracks
+    assert track.id == 1
+    assert track.size_px == pytest.approx([60, 150])
+    assert track.center_px == pytest.approx(whole.center_px, abs=3)
+
+
+def test_what_comes_into_view_slowly_is_confirmed_by_the_travel_since_more_than_a_tip_was_seen():
+    """Its tip was whole, and the rear edge of the tip was not the target's."""
+    tracker, first = Tracker(tracking_settings(replace(MOVING_BIRD, detector="auto")), SIZE), None
+    for i in range(70):
+        front = 630 - i
+        right = min(front + 40, 639.5)
+        cut = front + 40 > 639.5
+        box = seen((front + right) / 2, 300, right - front, 8 if i < 10 else 30, 0.1 if cut else 0.3, clipped=cut)
+        tracks = tracker.update([seen(front + 2, 300, 3, 6, 0.1) if i < 8 else box], i / RATE)
+        first = i if first is None and any(track.confirmed for track in tracks) else first
+    assert first is not None
+    assert first < 45  # the window of the travel has the tip until 58
+
+
+def test_a_box_that_is_far_larger_is_not_a_whole_target():
+    """A bird is missed before a cloud, and goes on behind it."""
+    tracker = Tracker(tracking_settings(MOVING_BIRD), SIZE)
+    for i in range(75):
+        bird, cloud = seen(100 + 5 * i, 200, 14, 16), seen(240, 190, 70, 90)
+        tracks = tracker.update([bird] if i < 25 else [cloud] if i < 38 else [bird, cloud], i / RATE)
+        assert tracks[0].id == 1
+        assert tracks[0].size_px == pytest.approx([14, 16])
+    assert tracks[0].missed == 0
+    assert tracks[0].center_px == pytest.approx(bird.center_px, abs=3)
+
+
+@pytest.mark.parametrize(("side", "left"), [(12, [(2, False)]), (40, [(1, True), (2, True)])], ids=["hand", "child"])
+def test_what_is_far_smaller_than_the_box_around_it_is_not_found_by_it(side, left):
+    """It was followed for a second before the larger target came, so that it did not come into view with it."""
+    tracker = Tracker(PLAIN, SIZE)
+    for i in range(90):
+        small, large = seen(300, 200, side, side), seen(max(300, 500 - 8 * max(0, i - 25)), 200, 60, 150)
+        tracks = tracker.update([small] if i < 25 else [small, large] if i < 45 else [large], i / RATE)
+        assert i < 30 or i > 50 or [track.id for track in tracks] == [1, 2]
+    assert [(track.id, track.shared) for track in tracks] == left
+
+
 def test_shared_detection_is_marked_as_such():
     tracker = Tracker(PLAIN)
     for i in range(20):
