@@ -190,13 +190,13 @@ def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
     from cotarget.pipeline import follow
     from cotarget.recording.recorder import COLUMNS, step_row, utc_text
     from cotarget.recording.replay import until_end
+    from cotarget.safety.signals import deferred_signals
     from cotarget.video import FilmWriter
 
     target = run.config.target(run.name)
     detector = make_detector(target, run.rate_hz)
     counts, reasons = StepCounts(), Reasons()
-    # Counts come first, next to the table's row, so that Ctrl-C finds hardly any time between the two.
-    observers: tuple[Observer, ...] = (counts, run.selection, reasons, LensAtItsEnd(run.name, target), *more)
+    observers: tuple[Observer, ...] = (run.selection, reasons, counts, LensAtItsEnd(run.name, target), *more)
     epoch: datetime | None = None
     interrupt: KeyboardInterrupt | None = None
     try:
@@ -215,12 +215,13 @@ def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
             steps = follow(rig, run.calibration, target, detector, selector=selector, seconds=run.seconds, insist=True)
             try:
                 for step in until_end(steps, run.replay):
-                    if table is not None:
-                        table.write(step_row(step, epoch))
-                    for observer in observers:
-                        observer.see(step)
-                    if film is not None:
-                        film.write(side_by_side(step, run.name, step.fixed.t - counts.first_t), step.fixed.t)
+                    with deferred_signals():  # table, counts and film have the same steps
+                        if table is not None:
+                            table.write(step_row(step, epoch))
+                        for observer in observers:
+                            observer.see(step)
+                        if film is not None:
+                            film.write(side_by_side(step, run.name, step.fixed.t - counts.first_t), step.fixed.t)
                     progress(step.index + 1, run.expected, f"following: {run.name}: {step.state}")
             except KeyboardInterrupt:
                 if run.expected is not None or not counts.steps:

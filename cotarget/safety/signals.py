@@ -1,11 +1,12 @@
 """Halt the head and complete files before a signal ends or suspends the process."""
 
+import contextlib
 import logging
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
@@ -103,3 +104,19 @@ class DeferredSignals:
         self.pending.append(number)
         if self._may_hurry and len(self.pending) >= IMPATIENCE:
             raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def deferred_signals() -> Iterator[None]:
+    """Defer SIGINT, SIGTERM and other ending signals in this block, and deliver the first one after it.
+
+    `IMPATIENCE` signals end the block, if for example a pipe takes no more data.
+    """
+    deferred = DeferredSignals()
+    deferred.let_hurry()
+    try:
+        deferred.defer()
+        yield
+    finally:
+        deferred.restore()
+    deferred.deliver()

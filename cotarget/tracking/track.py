@@ -10,7 +10,7 @@ import statistics
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -73,9 +73,10 @@ class AxisFilter:
         self.covariance = AxisCovariance(P.position, P.cross, P.velocity - gain * P.velocity)
 
 
-# A box shows nothing of a track in it whose area is smaller by this factor: a hand, once followed, in its person's box.
-# Of a group of people, each is a larger part.
-MEMBER = 10.0
+# Areas that differ by more than this factor are those of different objects, or of a part and its object: a bird and a
+# cloud, a hand and its person. Each person of a group has a larger part of the group's box.
+LARGEST_AREA_RATIO = 10.0
+
 
 # Histories of a track's size and travel
 
@@ -86,6 +87,22 @@ LARGEST_STEP = 2 / 3
 # A shorter step is no jump: outlines consist of whole pixels and flicker [px].
 LEAST_JUMP_PX = 3.0
 Edges = tuple[float, float]
+
+
+class TrailBox(NamedTuple):
+    """A box of a trail.
+
+    Attributes:
+        t: time [s].
+        edges: low and high edge along u and v [px].
+        step: motion since the box before [px].
+        area: area [px^2]; inf for a clipped box, whose visible edges are the target's.
+    """
+
+    t: float
+    edges: tuple[Edges, Edges]
+    step: float
+    area: float
 
 
 class SizeHistory:
@@ -115,9 +132,9 @@ class SizeHistory:
         while boxes[0][0] < t - self._span_s:
             boxes.popleft()
         # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones. One that is far
-        # smaller than a cut one is a part that was seen first, such as a hand.
+        # smaller than a cut one shows a part that was seen first, such as a hand.
         largest = max((math.prod(sides) for _, sides, is_cut in boxes if is_cut), default=0.0)
-        whole = [sides for _, sides, is_cut in boxes if not is_cut and MEMBER * math.prod(sides) >= largest]
+        whole = [sides for _, sides, is_cut in boxes if not is_cut and LARGEST_AREA_RATIO * math.prod(sides) >= largest]
         counted, middle = (whole, statistics.median) if whole else ([sides for _, sides, _ in boxes], max)
         usual = _newest(counted) if self._trend else counted
         self.size = np.array([middle(lengths) for lengths in zip(*usual, strict=True)])
@@ -150,12 +167,10 @@ class Trail:
         """
         self._span_s = span_s
         self._extents = image_size or (None, None)
-        # Time [s] and edges of each box, the length of the step to it [px], and its area [px^2]; inf for a clipped box,
-        # whose edge in view is the target's.
-        self._boxes: deque[tuple[float, tuple[Edges, Edges], float, float]] = deque()
+        self._boxes: list[TrailBox] = []
 
     def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
-        """Add a box, and forget whole ones that showed only a part of what it shows.
+        """Add a box, and forget whole boxes that showed only a part of the target.
 
         Args:
             t: time of the frame [s].
@@ -164,21 +179,19 @@ class Trail:
             clipped: whether the image's border cuts the box.
         """
         across, down = (_edges(*of, clipped) for of in zip(center, size, self._extents, strict=True))
-        area = math.prod(size)
-        if any(MEMBER * box[3] < area for box in self._boxes):
-            self._boxes = deque(box for box in self._boxes if MEMBER * box[3] >= area)
-        step = _common_motion([self._boxes[-1][1]], [(across, down)]) if self._boxes else 0.0
-        self._boxes.append((t, (across, down), step, math.inf if clipped else area))
-        while self._boxes[0][0] < t - self._span_s:
-            self._boxes.popleft()
+        begin, area = t - self._span_s, math.prod(size)
+        self._boxes = [box for box in self._boxes if box.t >= begin and LARGEST_AREA_RATIO * box.area >= area]
+        step = _common_motion([self._boxes[-1].edges], [(across, down)]) if self._boxes else 0.0
+        self._boxes.append(TrailBox(t, (across, down), step, math.inf if clipped else area))
 
     def move(self, by: Array) -> None:
         """Move all boxes with the scene, by (du, dv) [px]."""
         du, dv = by.tolist()
-        self._boxes = deque(
-            (t, ((left + du, right + du), (top + dv, bottom + dv)), step, area)
-            for t, ((left, right), (top, bottom)), step, area in self._boxes
-        )
+        self._boxes = [
+            box._replace(edges=((left + du, right + du), (top + dv, bottom + dv)))
+            for box in self._boxes
+            for (left, right), (top, bottom) in [box.edges]
+        ]
 
     def travel(self) -> float:
         """Compute how far the target has moved, edge by edge [px]; 0 if it jumped.
@@ -186,7 +199,7 @@ class Trail:
         Both edges of a moving target move the same way. A cloud or a shadow that drifts slowly behind others grows,
         shrinks and falls apart, which moves its centre, while an edge or two stay.
         """
-        _, edges, steps, _ = zip(*self._boxes, strict=True)
+        edges, steps = [box.edges for box in self._boxes], [box.step for box in self._boxes]
         count = max(1, min(3, len(edges) // 3))  # medians of three, because outlines flicker
         way = _common_motion(edges[:count], edges[-count:])
         longest = max(steps[1:], default=0.0)

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from cotarget.geometry import Array, intersection_areas
 from cotarget.tracking.track import (
     CUT,
-    MEMBER,
+    LARGEST_AREA_RATIO,
     LiveTrack,
     Measurement,
     Track,
@@ -276,7 +276,7 @@ class _Pairs:
         new_object |= weak & ~np.array(self.confirmed)[:, None]
         # A target whose box merged with another still overlaps its track.
         self.possible = ((self.distance <= settings.gate) & ~new_object) | (overlap > settings.overlap_enough)
-        self.possible &= ~known | (self.area_ratio < MEMBER)
+        self.possible &= ~known | (self.area_ratio < LARGEST_AREA_RATIO)  # a clipped box has an unknown area
 
 
 def _least_likely(states: Sequence[LiveTrack], image_size: tuple[int, int] | None, clutter: Array) -> Array:
@@ -341,7 +341,7 @@ def _merged(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
     merged: dict[int, int] = {}
     if sum(pairs.confirmed) < 2:
         return merged
-    members = (pairs.covered > pairs.settings.covered) & (pairs.area_ratio < MEMBER)
+    members = (pairs.covered > pairs.settings.covered) & (pairs.area_ratio < LARGEST_AREA_RATIO)
     inside = members & np.array(pairs.confirmed)[:, None]
     for j in np.flatnonzero(np.count_nonzero(inside, axis=0) > 1):
         covered = [int(i) for i in np.flatnonzero(inside[:, j]) if matches.get(int(i), j) == j]

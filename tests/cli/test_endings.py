@@ -2,6 +2,7 @@
 
 import csv
 import json
+import signal
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -14,6 +15,7 @@ from cotarget.backends import OPENERS
 from cotarget.cli.following import FEW, MANY, LensAtItsEnd, Reasons, StepCounts
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.errors import DeviceError
+from cotarget.files import CsvFile
 from cotarget.pipeline import State
 from cotarget.video import Film, FilmWriter
 from tests.support.commands import OLD, call, refused
@@ -83,6 +85,23 @@ def test_follow_halts_the_head_then_keeps_the_steps_so_far(folder, capsys, monke
     assert rig.written == [OLD]
     assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
     assert not [path for path in folder.iterdir() if ".part" in path.name]
+
+
+def test_ctrl_c_while_a_row_is_written_leaves_table_film_and_count_of_the_same_steps(folder, capsys, monkeypatch):
+    """The signal comes after the row and before the step is counted and drawn."""
+    write, rows = CsvFile.write, []
+
+    def interrupted(table, row):
+        write(table, row)
+        rows.append(row)
+        if len(rows) == FRAMES:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(CsvFile, "write", interrupted)
+    monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig({}))
+    status, out, err = call(capsys, *FOLLOW)
+    assert (status, err) == (0, "")
+    assert json.loads(out)["steps"] == rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
 
 
 @pytest.mark.parametrize("failing", ["head.move", "fixed.read"])
