@@ -323,7 +323,10 @@ class TargetFusion:
                 fixed_view = self.search.finder.update_fixed(frame, measured.box, mask)
                 if fixed_view is not None:  # the same body point that the zoom image measures
                     body = replace(measured.box, center_px=fixed_view.body_px)
-                    measured = replace(measured, box=body, sigma_px=fixed_view.body_sigma_px)
+                    sigma_px = fixed_view.body_sigma_px
+                    if self._target.matcher == "upright":  # without its feet, a box has its middle higher
+                        sigma_px = np.hypot(sigma_px, [0.0, abs(body.size_px[1] - track.size_px[1]) / 2])
+                    measured = replace(measured, box=body, sigma_px=sigma_px)
             self._filters[track.id].update_fixed(
                 measured.box, frame.t, sigma_px=measured.sigma_px, size_px=measured.size_px
             )

@@ -79,6 +79,7 @@ class AutoDetector:
         self._clutter = Clutter()
         self._width = 0
         self._steady = False  # whether large targets were searched in the last image
+        self._apart: list[Detection] = []  # small targets that are no part of a large one, best first
         self._begun = np.zeros(2)  # the camera's shift when the background was begun [px]
         self._shifts: deque[tuple[float, Array]] = deque()  # the camera's shift in the last frames [px]
         self._moved: dict[int, tuple[float, Array]] = {}  # when a track last moved by its size, and where to
@@ -87,9 +88,16 @@ class AutoDetector:
 
     @property
     def mask(self) -> Image | None:
-        """Foreground of the background model, and boxes of small targets by their score, (H, W), 0 to 255."""
-        small, large = self._small.mask, self._large.mask if self._steady else None
-        return small if small is None or large is None else np.asarray(cv2.max(small, large), dtype=np.uint8)
+        """Foreground of the background model, and boxes of small targets elsewhere by their score, (H, W), 0 to 255."""
+        large = self._large.mask if self._steady else None
+        if large is None:
+            return self._small.mask
+        boxes = np.zeros_like(large)
+        for each in reversed(self._apart):
+            first = np.rint(each.center_px - (each.size_px - 1) / 2).astype(int)
+            last = np.rint(each.center_px + (each.size_px - 1) / 2).astype(int)
+            cv2.rectangle(boxes, first.tolist(), last.tolist(), round(255 * each.score), cv2.FILLED)
+        return np.asarray(cv2.max(boxes, large), dtype=np.uint8)
 
     @property
     def shift(self) -> Array:
@@ -119,7 +127,9 @@ class AutoDetector:
         large = [replace(each, score=LARGE_SCORE) for each in self._large.detect(frame)]
         outlined = [target.beside <= PLAIN for target, _ in targets]
         large = [each for each in large if each.size_px.max() >= LARGE_PART * width]
-        return self._by_shape(fuse(small, outlined, self._are_followed(small, frame.t), large))
+        found = fuse(small, outlined, self._are_followed(small, frame.t), large)
+        self._apart = [each for each in found if any(each is one for one in small)]
+        return self._by_shape(found)
 
     def _by_shape(self, found: Sequence[Detection]) -> list[Detection]:
         """Weigh the scores by the expected shape, if there is one, but not those of clipped boxes; best first."""

@@ -203,6 +203,23 @@ def test_parts_of_a_large_target_are_not_listed_beside_it():
     assert [each.size_px.tolist() for each in fuse([outline], [False], [False], [person])] == [[30, 100]]
 
 
+def test_the_foreground_of_a_large_target_has_its_outline_and_no_boxes_of_its_parts():
+    """Where a body is in its box, for the close-up, is measured by the foreground. It walks by, thin as a diamond."""
+    rng, rate = np.random.default_rng(4), 25.0
+    background, surface = scenery((640, 480), rng), texture(60, 140, rng)
+    body = cv2.fillConvexPoly(np.zeros((140, 60), np.uint8), np.array([[30, 0], [59, 70], [30, 139], [0, 70]]), 1)
+    near = cv2.dilate(cv2.copyMakeBorder(body, 20, 20, 20, 20, cv2.BORDER_CONSTANT), np.ones((11, 11), np.uint8))
+    detector, beside = AutoDetector(rate), []
+    for i in range(40):
+        picture, u = background.copy(), 100 + 4 * i
+        if i >= 10:
+            picture[250:390, u : u + 60][body > 0] = surface[body > 0]
+        detector.detect(Frame(noisy(picture, rng, NOISE), i / rate))
+        if i >= 20:
+            beside.append(cv2.countNonZero(detector.mask[230:410, u - 20 : u + 80] * (1 - near)))
+    assert max(beside) < 0.01 * body.sum()
+
+
 def test_what_sways_at_one_place_loses_its_score_and_what_flies_through_does_not():
     """By hand: after 10 s the usual score is 0.6 (1 - 1/e) = 0.38, which divides the odds of 1.5 by 1 + 0.38 / 0.03. A
     target that crosses a cell in four frames has seen itself there."""

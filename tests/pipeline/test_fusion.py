@@ -365,6 +365,24 @@ def test_the_finder_measures_the_centre_of_the_followed_body():
     assert other[0] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_a_standing_body_without_its_feet_in_one_frame_stays_where_it_is():
+    """The detector loses the lowest 12 of 120 px: the box's middle is 6 px higher, the body's is not."""
+    usual = Detection(np.array(CENTER), np.array([50.0, 120.0]), 1.0)
+    cut = replace(usual, center_px=usual.center_px - (0, 6), size_px=np.array([50.0, 108.0]))
+
+    class Exact(Finder):
+        def update_fixed(self, frame, detection, mask):
+            return type("View", (), {"body_px": detection.center_px, "body_sigma_px": np.array([1.5, 0.7])})
+
+    fusion = TargetFusion(CALIBRATION, PERSON, SIZE)
+    fusion.follow(1)
+    fusion.search.finder = Exact()
+    t = seen(fusion, lambda t: [track(1, usual, t)], 20) + FRAME_S
+    show(fusion, t, [replace(track(1, usual, t), box=cut)])
+    x = fusion.estimate(1, t).x_fixed
+    assert abs(x[1] * FOCAL / x[2]) < 0.3
+
+
 # ---------------------------------------------------------------- contradictions
 UNFOUND = int(FusionSettings.unfound_s / FRAME_S) + 2  # frames
 
