@@ -26,7 +26,7 @@ from cotarget.estimation.zoom_matching import CloseupFinder, Expected, Finder, M
 from cotarget.geometry import Array
 from cotarget.pantilt import towards
 from cotarget.rig import Frame, Image, PanTiltState, ZoomState
-from cotarget.tracking.track import Measurement, Track, missing, room_inside
+from cotarget.tracking.track import LARGEST_AREA_RATIO, Measurement, Track, missing, room_inside
 
 REMEMBERED_S = 2.0  # longer than any latency [s]
 # States for the cubic interpolation: two before a time and two after it. A straight line through the nearest two is
@@ -287,6 +287,7 @@ class TargetFusion:
         self._filters: dict[int, TargetFilter] = {}  # of the most important tracks
         self._followed: int | None = None
         self._seen_well_s: dict[int, float] = {}  # time for which each track was seen well in the close-up [s]
+        self._areas: dict[int, float] = {}  # area of the largest whole box of each track [px^2]
         self._unlikely: set[int] = set()  # tracks whose size or pointing contradicts the priors
         self._T_base_fixed = calibration.zoom_head.T_base_fixed
         self.states = StateHistory()
@@ -313,11 +314,14 @@ class TargetFusion:
         numbers = {track.id for track in tracks}
         self._seen_well_s = {number: seconds for number, seconds in self._seen_well_s.items() if number in numbers}
         self._unlikely &= numbers
+        self._areas = {number: area for number, area in self._areas.items() if number in numbers}
         kept = self._most_important(tracks, favoured)
         self._filters = {track.id: self._filters.get(track.id) or self._make_filter() for track in kept}
         for track in kept:
             if track.missed:
                 continue
+            if self._was_part(track):
+                self._filters[track.id] = self._make_filter()
             measured = measure(track, self._target)
             if track.id == self._followed and measured.is_whole and isinstance(measured.box, Detection):
                 fixed_view = self.search.finder.update_fixed(frame, measured.box, mask)
@@ -330,6 +334,16 @@ class TargetFusion:
             self._filters[track.id].update_fixed(
                 measured.box, frame.t, sigma_px=measured.sigma_px, size_px=measured.size_px
             )
+
+    def _was_part(self, track: Track) -> bool:
+        """Whether what a track has shown so far, such as a hand, was a part of what it shows now."""
+        area = float(track.box.size_px.prod())
+        was_part = area >= LARGEST_AREA_RATIO * self._areas.get(track.id, math.inf)
+        if was_part:
+            del self._areas[track.id]
+        if not track.box.clipped and not track.shared:
+            self._areas[track.id] = max(area, self._areas.get(track.id, 0.0))
+        return was_part
 
     def _most_important(self, tracks: Sequence[Track], favoured: Collection[int]) -> list[Track]:
         """Select the tracks that have a filter, the followed one first."""

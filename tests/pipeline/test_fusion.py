@@ -365,6 +365,31 @@ def test_the_finder_measures_the_centre_of_the_followed_body():
     assert other[0] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_the_depth_is_that_of_a_person_whose_hand_came_first():
+    """At 10 m he is 122 px tall; his hand of 10 px alone would be a person at 122 m."""
+    hand = Detection(np.array([600.0, 240.0]), np.array([10.0, 10.0]), 1.0)
+    clipped = Detection(np.array([620.0, 240.0]), np.array([40.0, 122.0]), 1.0, clipped=True)
+    whole = Detection(np.array([600.0, 240.0]), np.array([50.0, FOCAL * PERSON.size / 10]), 1.0)
+    fusion, depths = TargetFusion(CALIBRATION, PERSON, SIZE), []
+    for i, box in enumerate([hand] * 3 + [clipped] * 3 + [whole] * 3):
+        show(fusion, i * FRAME_S, [track(1, box, i * FRAME_S)])
+        depths.append(fusion.estimate(1, i * FRAME_S).x_fixed[2])
+    assert depths[2] > 50
+    assert max(depths[3:]) < 15
+    assert depths[-1] == pytest.approx(10.0, rel=0.1)
+
+
+def test_a_bird_that_comes_near_keeps_its_velocity():
+    """From 4 px to 40 px in 2 s, across the image at 100 px a second: it was always the bird."""
+    fusion, off = TargetFusion(CALIBRATION, BIRD, SIZE), []
+    for i in range(51):
+        t, side = i * FRAME_S, 4.0 * 10 ** (i / 50)
+        show(fusion, t, [track(1, Detection(np.array([200 + 100 * t, 240.0]), np.array([side, side]), 1.0), t)])
+        ahead = fusion.estimate(1, t + 0.2).x_fixed
+        off.append(CENTER[0] + FOCAL * ahead[0] / ahead[2] - (220 + 100 * t))
+    assert np.abs(off[10:]).max() < 2
+
+
 def test_a_standing_body_without_its_feet_in_one_frame_stays_where_it_is():
     """The detector loses the lowest 12 of 120 px: the box's middle is 6 px higher, the body's is not."""
     usual = Detection(np.array(CENTER), np.array([50.0, 120.0]), 1.0)
