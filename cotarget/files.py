@@ -285,7 +285,7 @@ def read_table(
             reader = csv.DictReader(file, names)
             there = reader.fieldnames or ()
             if missing := [name for name in columns if name not in there]:
-                raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(columns)}")
+                raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(columns)}, separated by commas")
             parsers = {**columns, **{name: read for name, read in (optional or {}).items() if name in there}}
             for row in reader:
                 line = reader.line_num

@@ -161,7 +161,7 @@ CALLS = [
     ("view --rig hw.toml", FAILED, "hw.toml: backend"),
     ("detect text.mp4 --target bird --csv new.csv", FAILED, "text.mp4"),
     (f"{DETECT} none/new.csv", FAILED, "none/new.csv"),
-    (f"{DETECT} new.csv --labels other.csv", FAILED, "other.csv", "frame, x_px"),
+    (f"{DETECT} new.csv --labels other.csv", FAILED, "other.csv", "frame, x_px", "separated by commas"),
     (f"{DETECT} new.csv --video new.txt", FAILED, "new.txt", ".mp4"),
     (f"{DETECT} new.csv --labels cut.txt", FAILED, "cut.txt", "line 1 is cut off; it wants frame, id, left"),
     (f"{DETECT} new.csv --iou 0.5", FAILED, "--iou", "--labels"),
