@@ -328,7 +328,7 @@ class TargetFusion:
                 if fixed_view is not None:  # the same body point that the zoom image measures
                     body = replace(measured.box, center_px=fixed_view.body_px)
                     sigma_px = fixed_view.body_sigma_px
-                    if self._target.matcher == "upright":  # without its feet, a box has its middle higher
+                    if self._target.matcher == "upright":  # a box without the feet has its middle too high
                         sigma_px = np.hypot(sigma_px, [0.0, abs(body.size_px[1] - track.size_px[1]) / 2])
                     measured = replace(measured, box=body, sigma_px=sigma_px)
             self._filters[track.id].update_fixed(
@@ -336,7 +336,7 @@ class TargetFusion:
             )
 
     def _was_part(self, track: Track) -> bool:
-        """Whether what a track has shown so far, such as a hand, was a part of what it shows now."""
+        """Note the box's area; tell whether the boxes so far were of a part of the target, such as a hand."""
         area = float(track.box.size_px.prod())
         was_part = area >= LARGEST_AREA_RATIO * self._areas.get(track.id, math.inf)
         if was_part:
