@@ -42,7 +42,7 @@ TRACK_FEATURES = {
     "dv": (-4.0, 4.0),
     "width": (0.0, 1.0),  # width of its box, as a part of the image's
     "height": (0.0, 1.0),
-    "larger_side": (0.0, 1.0),  # larger side over the last wing beats, as a part of the image's width
+    "larger_side": (0.0, 1.0),  # larger side over the last wing beat, as a part of the image's width
     "unseen_s": (0.0, LONGEST_AGE_S),  # time since the last detection
 }
 

@@ -80,7 +80,9 @@ LARGEST_AREA_RATIO = 10.0
 
 # Histories of a track's size and travel
 
-# Quantile of the larger side over a wing beat that counts as its maximum, robust against one wrong frame in ten.
+# Window of the larger side [s]: a slow wing beat. With a longer one a bird that flies off counts as nearer than it is.
+BEAT_S = 0.5
+# Quantile of the larger side over that window that counts as its maximum, robust against one wrong frame in ten.
 BEAT_PART = 0.9
 # Largest part of the travel in one step; beyond it the outline jumped to that of another thing.
 LARGEST_STEP = 2 / 3
@@ -110,14 +112,14 @@ class SizeHistory:
 
     Attributes:
         size: usual width and height [px], (2,).
-        larger_side: largest of the larger sides [px].
+        larger_side: largest of the larger sides over a wing beat [px].
     """
 
     def __init__(self, span_s: float, trend: bool = False) -> None:
         """Create a history without boxes.
 
         Args:
-            span_s: window of the sizes [s].
+            span_s: window of the usual size [s], at least a wing beat.
             trend: whether the newest count more where the target grows or shrinks.
         """
         self._span_s, self._trend = span_s, trend
@@ -134,11 +136,17 @@ class SizeHistory:
         # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones. One that is far
         # smaller than a cut one shows a part that was seen first, such as a hand.
         largest = max((math.prod(sides) for _, sides, is_cut in boxes if is_cut), default=0.0)
-        whole = [sides for _, sides, is_cut in boxes if not is_cut and LARGEST_AREA_RATIO * math.prod(sides) >= largest]
-        counted, middle = (whole, statistics.median) if whole else ([sides for _, sides, _ in boxes], max)
-        usual = _newest(counted) if self._trend else counted
+        whole = [
+            (at, sides)
+            for at, sides, is_cut in boxes
+            if not is_cut and LARGEST_AREA_RATIO * math.prod(sides) >= largest
+        ]
+        counted, middle = (whole, statistics.median) if whole else ([(at, sides) for at, sides, _ in boxes], max)
+        sizes = [sides for _, sides in counted]
+        usual = _newest(sizes) if self._trend else sizes
         self.size = np.array([middle(lengths) for lengths in zip(*usual, strict=True)])
-        self.larger_side = _quantile([max(sides) for sides in counted], BEAT_PART)
+        since = counted[-1][0] - BEAT_S
+        self.larger_side = _quantile([max(sides) for at, sides in counted if at >= since], BEAT_PART)
 
 
 def _newest(boxes: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
@@ -294,7 +302,7 @@ class TrackingSettings:
         score_s: time constant of the average score [s]; a new track begins at 0.
         lose_s: time without a detection after which a confirmed track ends [s]; its age if that is less.
         drop_s: time without a detection after which an unconfirmed track ends [s].
-        size_s: window of the size's median and maximum, some two wing beats [s].
+        size_s: window of the size's median, some two wing beats [s].
         trend: whether the size follows a target that grows or shrinks. Wings look as if it did.
         gate: gate on the squared Mahalanobis distance of place and size, 99.9 % of a chi-square with three degrees of
             freedom.
@@ -388,7 +396,7 @@ class Track:
         center_px: filtered centre (u, v), (2,).
         velocity_px: velocity (du, dv) [px/s], (2,).
         size_px: filtered width and height, (2,).
-        larger_side_px: larger side over the last wing beats [px].
+        larger_side_px: larger side over the last wing beat [px].
         covariance: covariance of (u, v, du, dv), (4, 4).
         score: score of the last detection, 0 to 1.
         box: the last detection.

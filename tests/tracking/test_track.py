@@ -71,3 +71,16 @@ def test_the_size_of_a_target_that_drives_away_follows_it():
     assert filled(SizeHistory(0.6), car).size[0] > 1.3 * size[0]
     stride = [[0, 0, 40 + 15 * np.sin(2 * np.pi * 1.0 * i * DT), 120] for i in range(30)]
     assert filled(SizeHistory(0.6, trend=True), stride).size == pytest.approx(filled(SizeHistory(0.6), stride).size)
+
+
+@pytest.mark.parametrize("beat_hz", [2.5, 4.0])
+def test_the_larger_side_of_a_bird_that_flies_off_is_its_wingspan_of_the_last_beat(beat_hz):
+    """It becomes smaller by a third in a second; between two beats its wings look half as wide."""
+    spans = 60 * 0.985 ** np.arange(50)
+    wings = [span * (0.75 + 0.25 * np.cos(2 * np.pi * beat_hz * i * DT)) for i, span in enumerate(spans)]
+    history, errors = SizeHistory(0.6), []
+    for i, (wing, span) in enumerate(zip(wings, spans, strict=True)):
+        history.add(i * DT, (100.0, 100.0), (wing, 10.0), False)
+        errors.append(history.larger_side / span - 1)
+    assert np.mean(errors[15:]) == pytest.approx(0.0, abs=0.085)
+    assert max(errors[15:]) < 0.145
