@@ -5,6 +5,7 @@ u and v, so each coordinate has a filter of its own. They compute in floats: num
 numbers, and every track has two of them in every frame. Users of the tracker see a frozen `Track`.
 """
 
+import bisect
 import math
 import statistics
 from collections import deque
@@ -136,17 +137,13 @@ class SizeHistory:
         # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones. One that is far
         # smaller than a cut one shows a part that was seen first, such as a hand.
         largest = max((math.prod(sides) for _, sides, is_cut in boxes if is_cut), default=0.0)
-        whole = [
-            (at, sides)
-            for at, sides, is_cut in boxes
-            if not is_cut and LARGEST_AREA_RATIO * math.prod(sides) >= largest
-        ]
-        counted, middle = (whole, statistics.median) if whole else ([(at, sides) for at, sides, _ in boxes], max)
-        sizes = [sides for _, sides in counted]
+        whole = [box for box in boxes if not box[2] and LARGEST_AREA_RATIO * math.prod(box[1]) >= largest]
+        times, sizes, _ = zip(*(whole or boxes), strict=True)
+        middle = statistics.median if whole else max
         usual = _newest(sizes) if self._trend else sizes
         self.size = np.array([middle(lengths) for lengths in zip(*usual, strict=True)])
-        since = counted[-1][0] - BEAT_S
-        self.larger_side = _quantile([max(sides) for at, sides in counted if at >= since], BEAT_PART)
+        beat = sizes[bisect.bisect_left(times, times[-1] - BEAT_S) :]
+        self.larger_side = _quantile([max(sides) for sides in beat], BEAT_PART)
 
 
 def _newest(boxes: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
