@@ -12,9 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from cotarget.config import BoardConfig, check_corners
 from cotarget.errors import ConfigError, choices
@@ -46,6 +43,11 @@ def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
         ConfigError: the suffix is unknown, `check_board` refuses the board, the page is larger than 5 m, or the file
             cannot be written.
     """
+    # Here, because every command imports this module and this one alone draws.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{path}: cannot be drawn as '{path.suffix}'; the formats are: {choices(SUFFIXES)}")
     check_board(board)

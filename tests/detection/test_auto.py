@@ -21,7 +21,7 @@ FOUND = 0.95
 def scenery(size, rng):
     """A sky above a rough ground, (H, W, 3)."""
     width, height = size
-    picture = np.full((height, width, 3), 170.0)
+    picture = np.full((height, width, 3), 170.0, np.float32)
     ground = cv2.GaussianBlur(rng.normal(0, 1, (height - height // 3, width)), (0, 0), 2.0)
     picture[height // 3 :] = 90 + 25 * (ground / ground.std())[..., None]
     return picture
@@ -119,10 +119,10 @@ def test_a_large_target_before_a_plain_wall_is_not_taken_for_the_cameras_motion(
     """Most corners in the image are the target's; the wall has none, or faint ones (grey levels)."""
     rng, rate, width = np.random.default_rng(2), 25.0, size[0]
     spots = cv2.GaussianBlur(rng.normal(0, 1, (480, 640 + width)), (0, 0), 2.0)
-    wall = np.repeat((150 + rough * spots / spots.std())[..., None], 3, axis=2)
+    wall = np.repeat((150 + rough * spots / spots.std()).astype(np.float32)[..., None], 3, axis=2)
     places = [None] * 10 + [(5 * i, 150) for i in range(90)]  # it comes in from the left
     detector = make_detector(TARGET, rate)
-    pictures = [picture[:, width:] for picture in moved(wall, texture(*size, rng), places)]
+    pictures = (picture[:, width:] for picture in moved(wall, texture(*size, rng), places))
     tracks = follow(pictures, rate, rng, detector)
     right = [
         on(each, np.array(place) - (width, 0) + np.array(size) / 2, 8)
@@ -330,10 +330,11 @@ def test_a_bird_that_passes_before_a_balloon_is_not_taken_for_a_part_of_it(step)
 def test_a_dark_target_of_one_colour_is_found_before_a_textured_wall(size):
     """The rim of a dark target is as dark as a shadow of the wall."""
     rng, rate, found = np.random.default_rng(11), 25.0, []
-    wall = cv2.GaussianBlur(rng.normal(0, 1, (480, 640, 1)), (0, 0), 2.0)[..., None].repeat(3, axis=2)
+    spots = cv2.GaussianBlur(rng.normal(0, 1, (480, 640, 1)), (0, 0), 2.0)
+    wall = np.repeat((120 + 20 * spots / spots.std()).astype(np.float32)[..., None], 3, axis=2)
     detector = BackgroundDetector(LARGE, rate)
     places = [None] * 20 + [(100 + 4 * i, 200) for i in range(50)]
-    for i, picture in enumerate(moved(120 + 20 * wall / wall.std(), np.full((*size[::-1], 3), 30.0), places)):
+    for i, picture in enumerate(moved(wall, np.full((*size[::-1], 3), 30.0), places)):
         image = noisy(cv2.GaussianBlur(picture, (0, 0), 0.7), rng, NOISE)
         boxes = detector.detect(Frame(image, i / rate))
         if i >= 26:

@@ -20,7 +20,8 @@ from cotarget.emulators.axis_241q import (
     parse_options,
 )
 from cotarget.emulators.plant import Feed
-from tests.support.plants import DEADLINE_S, decoded, plain, publish, wait_for
+from tests.support.films import DEADLINE_S, plain, publish
+from tests.support.plants import decoded, wait_for
 
 JPEG_LEVELS = 3.0  # JPEG's error in the mean of a flat picture [grey levels]
 STREAM_HEAD = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=myboundary\r\n\r\n"

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from cotarget.emulators.axis_241q import AxisServer
-from tests.support.plants import Film, decoded
+from tests.support.films import Film
+from tests.support.plants import decoded
 
 pytestmark = pytest.mark.foreign
 SIZE = (640, 480)

@@ -1,10 +1,9 @@
-"""Emulated devices without a simulated world: axes, lenses and images, and each device with such behind it."""
+"""Emulated devices without a simulated world: axes, and each device with axes, lenses and images behind it."""
 
 import contextlib
 import os
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +15,6 @@ import serial
 
 from cotarget.drivers.ptu_d46 import D46Settings
 from cotarget.emulators.axis_241q import AxisServer
-from cotarget.emulators.plant import Feed, Picture
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.ports import UnitPorts
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
@@ -24,10 +22,10 @@ from cotarget.emulators.serve import Faults
 from cotarget.emulators.world import EmulatedAxis
 from cotarget.errors import DeviceError
 from cotarget.sim.motion import Axis
+from tests.support.films import DEADLINE_S, Film
 
 FEED_SIZE = (320, 240)
 USER, PASSWORD = "root", "hunter2 & co"
-DEADLINE_S = 20.0  # of real time: a loaded machine has reached it only if something hangs
 
 
 class AxisModel(EmulatedAxis):
@@ -82,69 +80,6 @@ class D46Unit(LiveUnit):
         )
 
 
-class LensModel:
-    """A lens that moves at once; a `LensPlant`.
-
-    Attributes:
-        commands: positions that were commanded.
-    """
-
-    last = 128
-
-    def __init__(self, position=0):
-        self.commands, self._position = [], position
-
-    def command(self, position):
-        assert 0 <= position <= self.last
-        self.commands.append(position)
-        self._position = position
-
-    def position(self):
-        return self._position
-
-
-class Film:
-    """Publishes images at a steady rate, as a camera does; a context manager.
-
-    Args:
-        draw: makes the image of an index.
-        period_s: of the images [s].
-
-    Attributes:
-        feed: of the images.
-    """
-
-    def __init__(self, draw, period_s=0.04):
-        self.feed, self._draw, self._period_s = Feed(), draw, period_s
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self):
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self._end.set()
-        self._thread.join(DEADLINE_S)
-
-    def _run(self):
-        index = 0
-        while True:
-            publish(self.feed, index, self._draw(index))
-            index += 1
-            if self._end.wait(self._period_s):
-                return
-
-
-def publish(feed, index, image, t=None):
-    feed.publish(Picture(image, index, time.monotonic() if t is None else t))
-
-
-def plain(size, colour):
-    """An image (width, height) of one colour or grey."""
-    return np.full((size[1], size[0], 3), colour, np.uint8)
-
-
 def decoded(jpeg):
     """The image of a JPEG; None if it is damaged."""
     return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
@@ -192,7 +127,7 @@ S5IS = """
 import sys
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
 from cotarget.emulators.serve import Faults
-from tests.support.plants import Film, LensModel, plain
+from tests.support.films import Film, LensModel, plain
 
 still, lens, faults = plain((3264, 2448), 90), LensModel(), Faults(S5IS_FAULTS)
 with (
