@@ -173,6 +173,7 @@ class FrameMatch:
         pairs: label and track of each match.
         missed: labels that count and have no track.
         false: tracks that are on no label.
+        excused: tracks on labels that do not count, and on no other.
         near: pairs of target and right or false track that are near enough, one-to-one or not, for IDF1.
     """
 
@@ -180,6 +181,7 @@ class FrameMatch:
     pairs: list[tuple[Label, Tracked]]
     missed: list[Label]
     false: list[Tracked]
+    excused: list[Tracked]
     near: list[tuple[int, int]]
 
 
@@ -203,12 +205,13 @@ def match_frames(
         pairs = [(counted[i], found[j]) for i, j in matched]
         before = {label.target: each.track for label, each in pairs}
         right, labels_found = {each.track for _, each in pairs}, {i for i, _ in matched}
-        excused: list[bool] = np.any(criterion.similarity(ignored, found) >= least, axis=0).tolist()
-        wrong = [each for each, excuse in zip(found, excused, strict=True) if each.track not in right and not excuse]
+        others = [each for each in found if each.track not in right]
+        excuse: list[bool] = np.any(criterion.similarity(ignored, others) >= least, axis=0).tolist()
+        wrong, excused = ([each for each, e in zip(others, excuse, strict=True) if e == of] for of in (False, True))
         judged = right | {each.track for each in wrong}
         near = [(counted[i].target, found[j].track) for i, j in np.argwhere(enough) if found[j].track in judged]
         missed = [label for i, label in enumerate(counted) if i not in labels_found]
-        matches.append(FrameMatch(frame, pairs, missed, wrong, near))
+        matches.append(FrameMatch(frame, pairs, missed, wrong, excused, near))
     return matches
 
 
@@ -311,7 +314,7 @@ def _id_found(matches: Sequence[FrameMatch]) -> int:
 
 def _false_tracks(tracks: Sequence[Tracked], matches: Sequence[FrameMatch]) -> int:
     """Count tracks that were off every label for half a second; frames without labels are a break for those once on."""
-    on = {track.track for match in matches for _, track in match.pairs}
+    on = {track.track for match in matches for track in (*(track for _, track in match.pairs), *match.excused)}
     off = {match.frame: {track.track for track in match.false} for match in matches}
     return false_tracks(
         (found[0].t, off.get(frame, {each.track for each in found if each.track not in on}))
@@ -492,7 +495,7 @@ def _label_rows(path: Path) -> Iterable[tuple[float, float | None, float, float,
     """Rows of a file of labels: frame and target, left, top, width and height, all from 0, and whether it counts."""
     if _is_mot(path):
         what = "ground truth of the MOT-challenge"
-        for row in read_table(path, dict.fromkeys(MOT_COLUMNS, _finite), what, names=MOT_COLUMNS):
+        for row in read_table(path, dict.fromkeys(MOT_COLUMNS, _finite) | {"id": _whole}, what, names=MOT_COLUMNS):
             frame, target, left, top, *rest = (row[name] for name in MOT_COLUMNS)
             yield frame - 1, target, left - 1, top - 1, *rest
     else:
@@ -505,8 +508,8 @@ def _is_mot(path: Path) -> bool:
     """Whether the first line of a file begins with a number."""
     try:
         with path.open(encoding="utf-8-sig") as file:
-            return file.readline().split(",")[0].strip().isdecimal()
-    except (OSError, UnicodeDecodeError):
+            return math.isfinite(float(file.readline().split(",")[0]))
+    except (OSError, ValueError):
         return False
 
 

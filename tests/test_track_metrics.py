@@ -194,6 +194,14 @@ def test_a_track_on_a_label_that_does_not_count_is_neither_right_nor_wrong():
     assert (score.boxes, score.found, score.false_boxes) == (0, 0, 1)
 
 
+def test_nor_is_it_false_in_frames_without_labels():
+    labels = boxes_of(Label, [(i, 1, 100) for i in (30, 60, 90)], counts=False)
+    tracks = boxes_of(Tracked, [(i, 1, 100) for i in range(FRAMES)])
+    assert score_tracks(tracks, labels, RATE, FRAMES).false_tracks == 0
+    beside = boxes_of(Tracked, [(i, 2, 200) for i in range(FRAMES)])
+    assert score_tracks([*tracks, *beside], labels, RATE, FRAMES).false_tracks == 1
+
+
 def test_such_a_track_finds_no_identity_either():
     """Track 1 is beside track 2 on a label that does not count, and takes over the target in the next frame."""
     labels = boxes_of(Label, [(0, 1, 100), (1, 1, 100)])
@@ -244,6 +252,10 @@ def test_ground_truth_of_the_mot_challenge_counts_from_one(tmp_path):
         (4, True, [12.5, 4.0]),
         (5, False, [1.0, 1.0]),
     ]
+    written = read_labels(write_labels(tmp_path / "gt.txt", ["3.0,4.0,13,5,2,1,1"], "2.0,9.0,1,1,1,1,1"))
+    assert {frame: [each.target for each in boxes] for frame, boxes in written.items()} == {1: [9], 2: [4]}
+    with pytest.raises(ConfigError, match=r"line 2 has '1\.5' for id"):
+        read_labels(write_labels(tmp_path / "gt.txt", ["3,1.5,13,5,2,1,1"], "2,9,1,1,1,1,1"))
     boxes = [each for labels in read_labels(VTEST).values() for each in labels]
     assert (len(boxes), sum(each.counts for each in boxes)) == (382, 356)
 
@@ -363,6 +375,17 @@ def test_labels_of_another_film_are_reported_and_not_pooled(folder, capsys):
     )
     pooled = json.loads(out)["pooled"]
     assert (pooled["films"], pooled["recall"], pooled["false_tracks"]) == (1, 1.0, 0)
+
+
+def test_labels_that_fit_no_film_of_a_folder_are_refused(folder, capsys):
+    for name in ("one", "two"):
+        write_labels(folder / "films" / f"{name}.csv", ["5000,5,5,9,9"])
+    assert detect_folder(folder) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.endswith(
+        "films: no labelled frame is in any of the films; give the labels of these films, with frames from 0\n"
+    )
 
 
 def test_labels_of_the_first_frames_alone_are_reported(folder, capsys):

@@ -19,7 +19,6 @@ from cotarget.detection.network import Network
 from cotarget.detection.small_target import SmallTargetDetector
 from cotarget.errors import ConfigError
 from cotarget.plugins import is_own, load, reporting
-from cotarget.rig import Image
 
 __all__ = [
     "BIRD",
@@ -39,13 +38,12 @@ __all__ = [
 ]
 
 
-def make_detector(target: TargetProfile, rate_hz: float, template: Image | None = None) -> Detector:
+def make_detector(target: TargetProfile, rate_hz: float) -> Detector:
     """Make the detector that a target profile names.
 
     Args:
         target: target profile.
         rate_hz: nominal frame rate of the camera [Hz].
-        template: image of the target for the detector "colour", (h, w, 3) BGR; that of the target profile by default.
 
     Raises:
         ConfigError: a colour target has no usable template, a network cannot be run, or a detector of the user's own
@@ -65,16 +63,14 @@ def make_detector(target: TargetProfile, rate_hz: float, template: Image | None 
         upright = target.matcher == "upright"
         settings = BIRD if target.motion == "flying" else PERSON if upright else GENERAL
         return BackgroundDetector(plain(settings) if kind == "mog2" else settings, rate_hz)
+    if target.template is None:
+        raise ConfigError('a target with detector = "colour" needs a template, a picture of the target')
+    if not target.template.exists():
+        raise ConfigError(f"{target.template}: no such file; a target's template is a PNG or JPEG of it")
+    template = cv2.imread(str(target.template), cv2.IMREAD_COLOR) if target.template.is_file() else None
     if template is None:
-        if target.template is None:
-            raise ConfigError('a target with detector = "colour" needs a template, a picture of the target')
-        if not target.template.exists():
-            raise ConfigError(f"{target.template}: no such file; a target's template is a PNG or JPEG of it")
-        read = cv2.imread(str(target.template), cv2.IMREAD_COLOR) if target.template.is_file() else None
-        if read is None:
-            raise ConfigError(f"{target.template}: is not a picture; a target's template is a PNG or JPEG of it")
-        template = np.asarray(read, dtype=np.uint8)
-    return ColorTemplateDetector(template)
+        raise ConfigError(f"{target.template}: is not a picture; a target's template is a PNG or JPEG of it")
+    return ColorTemplateDetector(np.asarray(template, dtype=np.uint8))
 
 
 def make_network(target: TargetProfile) -> Network:

@@ -110,7 +110,7 @@ class AutoDetector:
         return self._small.camera.jumped
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """Detect the targets, best first.
+        """Detect the targets, best first; none in a frame that repeats the last one.
 
         Raises:
             CotargetError: the image's size changed.
@@ -118,9 +118,10 @@ class AutoDetector:
         targets = self._small.find(frame)
         width = self._width = frame.image.shape[1]
         self._steady = self._register(frame.t, width)
-        small = [detection for _, detection in targets]
-        if not self._small.repeated:  # a repeated frame shows no target, and says nothing of where they usually are
-            small = self._clutter.weigh(small, frame.t, width, self._held)
+        if self._small.repeated:  # it shows no target, and says nothing of where they usually are
+            self._apart = []
+            return []
+        small = self._clutter.weigh([detection for _, detection in targets], frame.t, width, self._held)
         if not self._steady:
             return self._by_shape(small)
         self._large.held = self._held

@@ -133,6 +133,8 @@ class Network:
             corners, scores, labels = LAYOUTS[config.layout](outputs, self._file.side.astype(float))
             if corners.shape != (len(scores), 4) or scores.ndim != 1 + (labels is None):
                 raise ValueError
+            if labels is None and not scores.shape[1]:  # no class
+                raise ValueError
             if ((scores < -ROUNDING) | (scores > 1 + ROUNDING)).any():
                 raise ValueError
         except (ValueError, IndexError, StopIteration):

@@ -259,7 +259,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
         name
         for name in summary[ours]
         if f" {FALSE_PER_MIN[-1]:g} " not in name
-        if not summary[ours][name] >= max(summary[way][name] for way in others) + AHEAD
+        if not summary[ours][name] >= max((summary[way][name] for way in others), default=0.0) + AHEAD
     ]
 
 

@@ -317,9 +317,9 @@ def _path(rng: np.random.Generator, images: Sequence[Image], side_px: float, rat
 
 def _gap(path: Array, side_px: float, taken: Sequence[tuple[float, ...]]) -> float:
     """Give the least gap between a path's boxes and those of the same frames, (frame, centre, size) [px]."""
-    frame, x, y, width, height = np.array(taken).T
+    frame, x, y, width, height = np.reshape(taken, (-1, 5)).T
     apart = np.abs(path[frame.astype(int)] - np.column_stack([x, y])) - np.column_stack([width, height]) / 2
-    return float((apart - side_px / 2).max(axis=1).min())
+    return float((apart - side_px / 2).max(axis=1).min(initial=np.inf))
 
 
 def draw_flyer(image: Image, center_px: Array, side_px: float, beat_rad: float, colour: Array) -> Box:

@@ -209,7 +209,7 @@ def test_the_foreground_of_a_large_target_has_its_outline_and_no_boxes_of_its_pa
     background, surface = scenery((640, 480), rng), texture(60, 140, rng)
     body = cv2.fillConvexPoly(np.zeros((140, 60), np.uint8), np.array([[30, 0], [59, 70], [30, 139], [0, 70]]), 1)
     near = cv2.dilate(cv2.copyMakeBorder(body, 20, 20, 20, 20, cv2.BORDER_CONSTANT), np.ones((11, 11), np.uint8))
-    detector, beside = AutoDetector(rate), []
+    detector, beside, on_body = AutoDetector(rate), [], []
     for i in range(40):
         picture, u = background.copy(), 100 + 4 * i
         if i >= 10:
@@ -217,7 +217,9 @@ def test_the_foreground_of_a_large_target_has_its_outline_and_no_boxes_of_its_pa
         detector.detect(Frame(noisy(picture, rng, NOISE), i / rate))
         if i >= 20:
             beside.append(cv2.countNonZero(detector.mask[230:410, u - 20 : u + 80] * (1 - near)))
+            on_body.append(cv2.countNonZero(detector.mask[250:390, u : u + 60] * body))
     assert max(beside) < 0.01 * body.sum()
+    assert np.mean(on_body) > 0.8 * body.sum()
 
 
 def test_what_sways_at_one_place_loses_its_score_and_what_flies_through_does_not():
@@ -253,6 +255,24 @@ def test_frames_that_come_twice_hide_no_clutter():
 
     assert max(scores(1)) < 0.4
     assert scores(2) == pytest.approx(scores(1), abs=0.02)
+
+
+def test_a_person_is_found_as_soon_where_frames_come_twice():
+    background, surface = scenery((640, 480), np.random.default_rng(1)), texture(60, 150, np.random.default_rng(1))
+    places = [None] * 15 + [(20 + 4 * i, 200) for i in range(30)]
+
+    def first(times):
+        """Time of the first confirmed track [s]."""
+        rng, detector, found = np.random.default_rng(2), make_detector(TARGET, 25.0 * times), []
+        tracker = Tracker(tracking_settings(TARGET), (640, 480))
+        for i, picture in enumerate(moved(background, surface, places)):
+            image = noisy(picture, rng, NOISE)
+            for t in [(i + k / times) / 25 for k in range(times)]:
+                tracks = update_tracks(tracker, detector.detect(Frame(image, t)), t, detector)
+                found += [t] * any(each.confirmed for each in tracks)
+        return found[0]
+
+    assert first(2) == pytest.approx(first(1), abs=0.1)
 
 
 def test_the_place_that_a_target_has_left_is_no_target():

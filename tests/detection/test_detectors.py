@@ -348,8 +348,9 @@ def test_who_walks_is_seen_again_soon_after_the_whole_picture_has_changed(what):
     )  # after half a second to learn, and to be clear of where he was then
 
 
-def test_the_kind_of_detector_follows_the_target():
+def test_the_kind_of_detector_follows_the_target(tmp_path):
     assert isinstance(motion("bird"), BackgroundDetector)
     assert isinstance(make_detector(DEFAULT_TARGETS["bird"], RATE), SmallTargetDetector)
-    red = TargetProfile(0.2, "width", 160.0, "colour")
-    assert isinstance(make_detector(red, RATE, cover()), ColorTemplateDetector)
+    cv2.imwrite(str(tmp_path / "cover.png"), cover())
+    red = TargetProfile(0.2, "width", 160.0, "colour", template=tmp_path / "cover.png")
+    assert isinstance(make_detector(red, RATE), ColorTemplateDetector)

@@ -270,6 +270,18 @@ def test_another_layout_gives_no_wrong_boxes(tmp_path):
                 assert found == [], (written, read)
 
 
+@pytest.mark.parametrize(("layout", "columns"), [("yolo", 4), ("yolov5", 5), ("rtdetr", 4)])
+def test_a_network_without_a_class_is_refused_in_one_line(tmp_path, layout, columns):
+    g = Graph()
+    one = g("ReduceMax", "x", axes=[1, 2, 3], keepdims=1)
+    table = g("Reshape", g("Mul", one, np.full((1, 1, 3, columns), 0.5)), g.const([1, 3, columns], np.int64))
+    perm = [0, 2, 1] if layout == "yolo" else [0, 1, 2]
+    g("Transpose", table, perm=perm, name="output")
+    path = g.save(tmp_path / "n.onnx", output=[1, columns, 3] if layout == "yolo" else [1, 3, columns])
+    with pytest.raises(ConfigError, match=rf'n\.onnx: gives output \([\d, ]+\); layout "{layout}" has [^\n]+$'):
+        detector(path, layout).detect(Frame(image(96, 64, red=(8, 4, 20, 8)), 0.0))
+
+
 def test_files_that_take_something_else_are_refused(tmp_path):
     """Each is refused before it is run, because OpenCV runs some of them with wrong results."""
     onnx_file = network(tmp_path / "n.onnx", "yolo")

@@ -192,6 +192,19 @@ def test_a_bird_in_front_of_rough_ground_is_found_by_what_it_does_to_the_picture
     assert sum(len(confirmed) > 1 for confirmed in tracks) <= 0.1 * 80  # it may fall in two for a moment
 
 
+def test_a_bird_in_front_of_rough_ground_is_found_at_a_hundred_frames_a_second():
+    """What is usual at a place is learnt by the time, and not by the number of frames."""
+    rng, rate = np.random.default_rng(8), 100.0
+    ground, detector, on = landscape(rng), SmallTargetDetector(), []
+    tracker = Tracker(tracking_settings(SPECK), (WIDTH, HEIGHT))
+    for i in range(240):
+        picture, at = ground.copy(), (30 + 40 * i / rate, 205)
+        draw(picture, *at, 10, 7, grey=40.0)
+        tracks = tracker.update(detector.detect(Frame(photograph(picture, rng), i / rate)), i / rate)
+        on.append(any(np.linalg.norm(t.center_px - at) < 5 for t in tracks if t.confirmed))
+    assert np.mean(on[120:]) > 0.9
+
+
 @pytest.mark.parametrize("times", [1, 2, 3])
 def test_a_bird_of_a_pixel_is_found_in_a_small_picture(times):
     """A film in half and a third of its size: the bird is 1.3 px long."""
