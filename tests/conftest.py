@@ -19,7 +19,7 @@ def pytest_xdist_auto_num_workers(config):
 
 @pytest.fixture(autouse=True, scope="session")
 def _bytecode(tmp_path_factory):
-    """Where nobody wants bytecode, programs that tests start keep it elsewhere: each would compile everything anew."""
+    """With PYTHONDONTWRITEBYTECODE, programs that tests start share bytecode in a temporary folder, to start fast."""
     if sys.dont_write_bytecode:
         folder = tmp_path_factory.getbasetemp()  # of this process; that above it is of all that run tests
         folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder

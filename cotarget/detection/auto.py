@@ -189,7 +189,7 @@ class Clutter:
         self._t = 0.0
 
     def forget(self) -> None:
-        """Start anew, after the camera has moved."""
+        """Drop what was learnt, after the camera has moved."""
         self._usual = None
 
     def weigh(

@@ -315,8 +315,8 @@ class BackgroundDetector:
         self._t = t
         if dt <= 0:
             dt = self._interval
-        anew, self._learnt = not self._learnt, self._learnt + dt
-        if anew:  # discard whatever the mixture learnt before
+        first, self._learnt = not self._learnt, self._learnt + dt
+        if first:  # discard whatever the mixture learnt before
             return 1.0
         return min(1.0, dt / min(self._settings.history_s, 2 * self._learnt))
 

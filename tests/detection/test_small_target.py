@@ -242,7 +242,7 @@ def test_noise_alone_makes_no_track(width, height, noise):
 
 
 def test_a_twig_that_sways_where_it_is_makes_no_track():
-    """Above the ground's rough edge, hither and thither by its own size as the wind takes it."""
+    """Above the ground's rough edge, to and fro by its own size in the wind."""
     rng = np.random.default_rng(7)
     way = 3 * np.cumsum(rng.normal(0, 0.5, 200)) % 8 - 4
 

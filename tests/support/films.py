@@ -1,4 +1,4 @@
-"""A lens and images without a simulated world, which a program that is started has at once: it needs no MuJoCo."""
+"""Lens and images of an emulated camera. Nothing here imports MuJoCo, so that a program with them starts fast."""
 
 import threading
 import time
