@@ -43,7 +43,7 @@ def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
         ConfigError: the suffix is unknown, `check_board` refuses the board, the page is larger than 5 m, or the file
             cannot be written.
     """
-    # Here, because every command imports this module and this one alone draws.
+    # Imported here: every command imports this module, and only this function needs matplotlib.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle

@@ -37,7 +37,6 @@ from cotarget.tracking.tracker import Tracker, update_tracks
 from cotarget.video import Film, FilmWriter
 
 COLUMNS = ("frame", "t", "track", "u_px", "v_px", "width_px", "height_px", "score")
-LEAST_WRITTEN = 0.001  # score of a detection in the table, where 0 says that there was none
 TRAIL_S = 1.0  # length of the trail that is drawn behind a target [s]
 # Colours (BGR) that are distinct on sky, grass and asphalt; a track keeps its own.
 COLOURS = ((60, 60, 255), (0, 200, 255), (80, 220, 60), (255, 160, 40), (255, 80, 220), (40, 140, 255), (230, 230, 60))
@@ -139,8 +138,8 @@ def _run(
 
 def _row(index: int, t: float, track: Track) -> list[str]:
     numbers = (*track.center_px, *track.size_px)
-    score = max(track.score, LEAST_WRITTEN) if track.missed == 0 else 0.0
-    return [str(index), f"{t:.4f}", str(track.id), *(f"{x:z.2f}" for x in numbers), f"{score:.3f}"]
+    score = track.score if track.missed == 0 else 0.0
+    return [str(index), f"{t:.4f}", str(track.id), *(f"{x:z.2f}" for x in numbers), f"{score:.3g}"]
 
 
 class Trails:

@@ -314,7 +314,8 @@ def _id_found(matches: Sequence[FrameMatch]) -> int:
 
 def _false_tracks(tracks: Sequence[Tracked], matches: Sequence[FrameMatch]) -> int:
     """Count tracks that were off every label for half a second; frames without labels are a break for those once on."""
-    on = {track.track for match in matches for track in (*(track for _, track in match.pairs), *match.excused)}
+    on = {track.track for match in matches for _, track in match.pairs}
+    on |= {track.track for match in matches for track in match.excused}
     off = {match.frame: {track.track for track in match.false} for match in matches}
     return false_tracks(
         (found[0].t, off.get(frame, {each.track for each in found if each.track not in on}))

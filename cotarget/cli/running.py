@@ -240,8 +240,7 @@ def _detect_in_folder(
         raise ConfigError(f"--sheet: {options.sheet}: a PNG is written; name a .png")
     with progress_bar() as progress:
         found = run_on_folder(films, target, options.csv, options.sheet, criterion, progress)
-    each = [(found["films"][film.stem], file) for film, file in films]
-    if all(one["shortfall"] is None and min(read_labels(file)) > one["last_frame"] for one, file in each):
+    if not (found["pooled"]["films"] or any(one["shortfall"] for one in found["films"].values())):
         raise ConfigError(
             f"{options.labels}: no labelled frame is in any of the films; give the labels of these films, with frames "
             "from 0"

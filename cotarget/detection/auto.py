@@ -119,7 +119,6 @@ class AutoDetector:
         width = self._width = frame.image.shape[1]
         self._steady = self._register(frame.t, width)
         if self._small.repeated:  # it shows no target, and says nothing of where they usually are
-            self._apart = []
             return []
         small = self._clutter.weigh([detection for _, detection in targets], frame.t, width, self._held)
         if not self._steady:

@@ -196,6 +196,11 @@ class History:
         """Time between the oldest and the newest image [s]."""
         return self._kept[-1][0] - self._kept[0][0] if self._kept else 0.0
 
+    @property
+    def kept_last(self) -> bool:
+        """Whether the last image was kept: it came at least SPACING_S after the one kept before."""
+        return bool(self._kept) and self._kept[-1][1] is self._last
+
     def add(self, t: float, grey: Image, shift: Array) -> bool:
         """Add an image; restart if its time jumped back or far ahead.
 
@@ -675,10 +680,9 @@ FEWEST_EARLIER = 3
 # Shift of the camera between two images up to which they are subtracted as they are, and up to which after they are
 # registered [px].
 STANDING_PX, SHAKING_PX = 0.5, 5.0
-# Usual difference, such as of a swaying branch, subtracted from the difference: its factor, and the width over which it
-# spreads [px]; the largest weight of the newest image in its mean, and the least time constant of the mean [s].
-USUAL_TIMES, SWAY_PX = 3.0, 5
-USUAL_GAIN, USUAL_S = 0.02, 5 / 3
+# Usual difference, such as of a swaying branch, subtracted from the difference: its factor, the weight of the newest
+# image that is kept in its mean, and the width over which it spreads [px].
+USUAL_TIMES, USUAL_GAIN, SWAY_PX = 3.0, 0.02, 5
 # Largest score of a clipped box, which may continue a track but not begin one: half of its surroundings are outside the
 # image, so a swaying twig looks isolated.
 MOST_CLIPPED_SCORE = 0.45
@@ -704,7 +708,6 @@ class SmallTargetDetector:
         self._history = History()
         self._warm_up_s = WARM_UP_S
         self._usual: Image | None = None  # mean difference from earlier images, float32
-        self._last_t = -math.inf  # time of the last frame [s]
         self.shift: Array = np.zeros(2)  # of the camera since the first frame [px], (2,)
         self._shape: tuple[int, ...] | None = None
         self.mask: Image | None = None
@@ -737,8 +740,7 @@ class SmallTargetDetector:
         if self.camera.jumped:
             self._history.clear()
             self._warm_up_s = AFTER_CUT_S
-        references, last_t = self._history.references(frame.t), self._last_t
-        self._last_t = frame.t
+        references = self._history.references(frame.t)
         self.repeated = not self._history.add(frame.t, grey, shift)
         self.mask = np.zeros(frame.image.shape[:2], np.uint8)
         if self.repeated or self._history.span < self._warm_up_s:
@@ -759,7 +761,7 @@ class SmallTargetDetector:
                 found.append((target, detection))
             if detection.score >= BELIEVED_SCORE and np.nanmax(since) >= ARRIVED:
                 arrived.append((target, detection))
-        differing = self._differing(grey, unit, times, shift, references, frame.t - last_t)
+        differing = self._differing(grey, unit, times, shift, references)
         found = _best_of(found + [_as_a_whole(pair, arrived) for pair in differing])
         for target, detection in reversed(found):
             (x, y), (w, h) = target.low, target.size
@@ -768,18 +770,11 @@ class SmallTargetDetector:
         return found
 
     def _differing(
-        self,
-        grey: Image,
-        unit: int,
-        times: int,
-        shift: Array,
-        references: list[tuple[Image, Array] | None],
-        since_s: float,
+        self, grey: Image, unit: int, times: int, shift: Array, references: list[tuple[Image, Array] | None]
     ) -> list[tuple[SmallTarget, Detection]]:
         """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
 
-        The difference of an image enlarged by a factor ``times`` is halved: a twig sways over more of its pixels. The
-        last frame was ``since_s`` ago.
+        The difference of an image enlarged by a factor ``times`` is halved: a twig sways over more of its pixels.
         """
         earlier = [kept for kept in references if kept is not None]
         if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > times * SHAKING_PX for _, then in earlier):
@@ -797,7 +792,8 @@ class SmallTargetDetector:
         if self._usual is None:
             self._usual = np.zeros(difference.shape, np.float32)
         usual = cv2.dilate(cv2.convertScaleAbs(self._usual, alpha=USUAL_TIMES), np.ones((SWAY_PX, SWAY_PX), np.uint8))
-        cv2.accumulateWeighted(difference, self._usual, min(USUAL_GAIN, since_s / USUAL_S))
+        if self._history.kept_last:  # not every frame of a fast camera: it would become usual sooner
+            cv2.accumulateWeighted(difference, self._usual, USUAL_GAIN)
         unusual = cv2.subtract(difference, usual)
         # A sky is zero but for the target; its surroundings are needed as well.
         least = LEAST_DIFFERENCE * LEAST_ROUGHNESS

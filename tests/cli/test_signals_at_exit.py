@@ -75,7 +75,7 @@ class Child:
         self.process = subprocess.Popen(
             [sys.executable, "-c", program], cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)},
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0,
-            process_group=0,  # the kernel suspends no group without a parent in its session, as under setsid
+            process_group=0,  # an orphaned process group, such as that of pytest under setsid, is not suspended
         )  # fmt: skip
         self.lines, self.rest = [], b""
 

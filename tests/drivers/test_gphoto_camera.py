@@ -19,7 +19,7 @@ from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.frame_buffer import FrameBuffer
 from cotarget.drivers.gphoto_camera import GphotoCamera, GphotoSettings, SharedState, Shooting, freshness
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
-from tests.support.films import DEADLINE_S
+from tests.support.emulated_camera import DEADLINE_S
 from tests.support.gphoto_link import CALL_S, CONFIG, PERIOD, PITCH_MM, SIZE, FakeLink, jpeg
 from tests.support.plants import s5is_process, wait_for
 from tests.support.simulated_clock import SimClock

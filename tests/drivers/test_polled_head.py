@@ -12,7 +12,7 @@ from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
 from cotarget.drivers.polled_head import AxisFacts, CutError, Poll, PolledHead, PolledHeadSettings
 from cotarget.drivers.serial_line import LostError, RefusedError, SilentError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
-from tests.support.films import DEADLINE_S
+from tests.support.emulated_camera import DEADLINE_S
 from tests.support.plants import fails, wait_for
 from tests.support.simulated_clock import SimClock
 

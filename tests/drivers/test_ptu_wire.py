@@ -19,7 +19,7 @@ from cotarget.drivers.ptu_d46 import D46Head
 from cotarget.drivers.serial_line import InUseError
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.errors import DeviceError
-from tests.support.films import DEADLINE_S
+from tests.support.emulated_camera import DEADLINE_S
 from tests.support.plants import D46Unit, fails, wait_for
 
 pytestmark = pytest.mark.wire

@@ -20,7 +20,7 @@ from cotarget.emulators.axis_241q import (
     parse_options,
 )
 from cotarget.emulators.plant import Feed
-from tests.support.films import DEADLINE_S, plain, publish
+from tests.support.emulated_camera import DEADLINE_S, plain, publish
 from tests.support.plants import decoded, wait_for
 
 JPEG_LEVELS = 3.0  # JPEG's error in the mean of a flat picture [grey levels]

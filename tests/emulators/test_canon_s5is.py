@@ -13,7 +13,7 @@ from cotarget.emulators import canon_s5is, ptpip
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isCamera, S5isServer, Shutter, Viewfinder
 from cotarget.emulators.plant import Feed
 from cotarget.emulators.serve import Faults
-from tests.support.films import DEADLINE_S, LensModel, plain, publish
+from tests.support.emulated_camera import DEADLINE_S, LensModel, plain, publish
 from tests.support.plants import decoded, wait_for
 
 OK, BUSY = 0x2001, 0x2019

@@ -14,7 +14,7 @@ from cotarget.emulators.emulation import Emulation
 from cotarget.emulators.world import paced
 from cotarget.errors import ConfigError
 from tests.support.commands import call
-from tests.support.films import DEADLINE_S
+from tests.support.emulated_camera import DEADLINE_S
 
 
 @pytest.fixture

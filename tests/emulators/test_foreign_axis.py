@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cotarget.emulators.axis_241q import AxisServer
-from tests.support.films import Film
+from tests.support.emulated_camera import Film
 from tests.support.plants import decoded
 
 pytestmark = pytest.mark.foreign

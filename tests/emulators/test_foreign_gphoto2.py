@@ -12,7 +12,7 @@ import pytest
 
 from cotarget.emulators.canon_s5is import S5isServer
 from cotarget.emulators.plant import Feed
-from tests.support.films import LensModel, publish
+from tests.support.emulated_camera import LensModel, publish
 
 pytestmark = pytest.mark.foreign
 TIMEOUT_S = 60  # gphoto2's own waits add up to a few seconds

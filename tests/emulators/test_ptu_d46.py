@@ -16,7 +16,7 @@ from cotarget.emulators.ptu_d46.ports import Wire
 from cotarget.emulators.ptu_d46.unit import D46_PAPER, D46_STOCK, E_SERIES, UnitProfile
 from cotarget.emulators.serve import Faults
 from cotarget.errors import ConfigError
-from tests.support.films import DEADLINE_S
+from tests.support.emulated_camera import DEADLINE_S
 from tests.support.plants import AxisModel, LiveUnit, wait_for
 
 STEP_S = 1e-3  # of simulated time

@@ -21,7 +21,7 @@ from cotarget.emulators.world import (
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import pose
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
-from tests.support.films import DEADLINE_S
+from tests.support.emulated_camera import DEADLINE_S
 from tests.support.plants import fails
 from tests.support.simulated_clock import SimClock
 

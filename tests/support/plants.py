@@ -22,7 +22,7 @@ from cotarget.emulators.serve import Faults
 from cotarget.emulators.world import EmulatedAxis
 from cotarget.errors import DeviceError
 from cotarget.sim.motion import Axis
-from tests.support.films import DEADLINE_S, Film
+from tests.support.emulated_camera import DEADLINE_S, Film
 
 FEED_SIZE = (320, 240)
 USER, PASSWORD = "root", "hunter2 & co"
@@ -127,7 +127,7 @@ S5IS = """
 import sys
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
 from cotarget.emulators.serve import Faults
-from tests.support.films import Film, LensModel, plain
+from tests.support.emulated_camera import Film, LensModel, plain
 
 still, lens, faults = plain((3264, 2448), 90), LensModel(), Faults(S5IS_FAULTS)
 with (
