@@ -22,6 +22,7 @@ from .pipeline import Step as Step
 from .pipeline import follow as follow
 from .rig import Frame as Frame
 from .rig import Rig as Rig
+from .safety.signals import handle_signals as handle_signals
 from .sim.world import SimWorld as SimWorld
 from .targeting import Aim as Aim
 from .targeting import Reach as Reach
@@ -53,6 +54,7 @@ __all__ = [
     "aim",
     "calibrate",
     "follow",
+    "handle_signals",
     "load_config",
     "observe",
     "open_rig",

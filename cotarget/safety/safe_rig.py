@@ -25,7 +25,7 @@ from cotarget.rig import (
     ZoomCamera,
     ZoomState,
 )
-from cotarget.safety.signals import DeferredSignals, end_politely
+from cotarget.safety.signals import DeferredSignals, guard_head
 from cotarget.safety.stop_file import refuse_if_stopped
 from cotarget.safety.watchdog import Watchdog, Watcher
 
@@ -50,7 +50,7 @@ class SafeHead:
         """Return the head's state now."""
         self._watchdog.on_call()
         state = self._head.state()
-        self._watchdog.saw(state, self._limits.step)
+        self._watchdog.saw(state, self._limits)
         return state
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
@@ -58,7 +58,7 @@ class SafeHead:
 
         Raises:
             EmergencyStopError: the head is stopped.
-            DeviceError: an angle is not a number, a speed is not above zero, or the device failed or left the limits.
+            DeviceError: an angle is not finite, a speed is not above zero, or the device failed or left the limits.
         """
         pan, tilt = clipped(pan, tilt, self._limits)
         speeds = self._limits.capped(speed)
@@ -181,7 +181,13 @@ class SafeZoomCamera(SafeCamera):
         return self._device.focal_range
 
     def zoom(self, focal_px: float) -> float:
-        """Start the lens moving; return the focal length [px] that it will really reach."""
+        """Start the lens moving; return the focal length [px] that it will really reach.
+
+        Raises:
+            DeviceError: the focal length is not finite.
+        """
+        if not math.isfinite(focal_px):
+            raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
         return self._device.zoom(focal_px)
 
     def state(self) -> ZoomState:
@@ -230,8 +236,13 @@ def soft_limits(device: PanTiltLimits, config: SafetyConfig) -> PanTiltLimits:
     """Combine the device's limits with the configured ones; the tighter ones hold.
 
     Raises:
-        ConfigError: no angle is left.
+        ConfigError: no angle is left, or a limit is not finite.
     """
+    if not (device.speed > 0 and device.acceleration > 0 and 0 <= device.step < math.inf):  # nan is none of these
+        raise ConfigError(
+            f"the head reports a speed of {device.speed}, an acceleration of {device.acceleration} and a step of "
+            f"{device.step}; correct its driver"
+        )
     return dataclasses.replace(
         device,
         pan=_within(config.pan_deg, device.pan, device.step, "safety.pan_deg"),
@@ -244,9 +255,9 @@ def clipped(pan: float, tilt: float, limits: PanTiltLimits) -> tuple[float, floa
     """Clip angles [rad] to the limits, or to the outermost step inside them, so that rounding cannot lead outside.
 
     Raises:
-        DeviceError: an angle is not a number.
+        DeviceError: an angle is not finite.
     """
-    if math.isnan(pan) or math.isnan(tilt):
+    if not (math.isfinite(pan) and math.isfinite(tilt)):
         raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
     return _clip(pan, limits.pan, limits.step), _clip(tilt, limits.tilt, limits.step)
 
@@ -255,12 +266,16 @@ def _within(
     soft_deg: tuple[float, float] | None, device: tuple[float, float], step: float, name: str
 ) -> tuple[float, float]:
     """Intersect soft limits [degrees] with the device's [rad]."""
+    own = [round(math.degrees(v), 1) for v in device]
+    if not device[0] <= device[1]:  # nor is nan
+        raise ConfigError(f"{name}: the head reports a range of {own}, which is none; correct its driver")
     if soft_deg is None:
+        if not all(map(math.isfinite, device)):
+            raise ConfigError(f"{name}: is missing; the head reports no end of its range, {own}")
         return device
     low, high = max(math.radians(soft_deg[0]), device[0]), min(math.radians(soft_deg[1]), device[1])
     first, last = _outermost((low, high), step)
     if low >= high or first > last:
-        own = [round(math.degrees(v), 1) for v in device]
         raise ConfigError(f"{name}: {list(soft_deg)} leaves nothing of the device's own range {own}")
     return low, high
 
@@ -291,7 +306,8 @@ def guard(rig: Rig, config: SafetyConfig) -> Rig:
         config: limits, times and stop file.
 
     Raises:
-        ConfigError: the rig is guarded already, or the soft limits leave nothing of the device's range.
+        ConfigError: the rig is guarded already, the soft limits leave nothing of the device's range, or a rig in real
+            time is opened outside of the main thread, see `cotarget.safety.signals.guard_head`.
         EmergencyStopError: a stop file exists.
     """
     if rig.guard is not None:
@@ -333,7 +349,7 @@ class _Guard:
         """Watch a rig in real time, and halt the head of any rig at the program's exit."""
         atexit.register(self.close)  # for a rig that the program does not close
         if self._rig.spec.real_time:
-            self._undo_signals = end_politely(self.watchdog.halt)
+            self._undo_signals = guard_head(self.watchdog)
             self._watcher = Watcher(self.watchdog)
 
     def stop(self, reason: str) -> None:

@@ -6,9 +6,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol
+
+from cotarget.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
@@ -19,43 +21,135 @@ FREEZING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTT
 SHELL_STATUS = 128  # a shell's exit status for a signal is this plus its number
 
 
-def end_politely(halt: Callable[[], None] | None = None) -> Callable[[], None]:
-    """Install signal handlers that halt the head before the process ends or is suspended.
+class GuardedHead(Protocol):
+    """A head that signal handlers halt, see `cotarget.safety.watchdog.Watchdog`."""
 
-    A signal that would end the process raises SystemExit, so that ``with`` blocks are left. One that would suspend it
-    does so after the head is halted, and not at all if the halt fails. Handlers that the program has set stay.
+    in_main_thread: bool  # whether the main thread opened it, or gave its last command
 
-    Args:
-        halt: halts the head, callable from a signal handler; if None, suspending signals end the process too.
+    def stop(self, reason: str) -> None:
+        """Halt the head, and refuse moves."""
+
+    def held(self) -> contextlib.AbstractContextManager[None]:
+        """Halt the head, and let no command begin in the block."""
+
+
+class _Process:
+    """The signal handlers of this process, and the heads that they halt."""
+
+    def __init__(self) -> None:
+        self.heads: list[GuardedHead] = []
+        self.handled = False  # whether `handle_signals` was called
+        self._undo: Callable[[], None] | None = None
+
+    def install(self) -> None:
+        """Install the handlers, unless they are installed."""
+        if self._undo is None:
+            handlers = dict.fromkeys(ENDING, self._end) | dict.fromkeys(FREEZING, self._freeze)
+            self._undo = _install(handlers | {signal.SIGINT: self._interrupt})
+
+    def remove(self, head: GuardedHead) -> None:
+        """Forget a head; remove the handlers after the last one, but for those of `handle_signals`."""
+        self.heads = [each for each in self.heads if each is not head]
+        if self._undo is not None and not (self.heads or self.handled) and is_main_thread():
+            self._undo()
+            self._undo = None
+
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        self._stop_elsewhere(number)
+        _leave(number, frame)
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        self._stop_elsewhere(number)
+        signal.default_int_handler(number, frame)
+
+    def _stop_elsewhere(self, number: int) -> None:
+        """Stop the heads of other threads, whose blocks the exception in the main thread does not leave."""
+        for head in self.heads:
+            if not head.in_main_thread:
+                head.stop(f"{signal.Signals(number).name} ends the program")
+
+    def _freeze(self, number: int, frame: FrameType | None) -> None:
+        with contextlib.ExitStack() as held:
+            may_suspend = True
+            for head in self.heads:
+                try:
+                    held.enter_context(head.held())
+                except Exception as error:
+                    may_suspend = False
+                    log.error("not suspended, because the head could not be halted: %s", error)
+            if may_suspend:
+                os.kill(os.getpid(), signal.SIGSTOP)
+
+
+_PROCESS = _Process()
+
+
+def handle_signals() -> None:
+    """Install signal handlers that halt every guarded head before this process ends or is suspended.
+
+    Call it in the main thread of a program that opens rigs in other threads; Python runs signal handlers in the main
+    thread alone. A rig that is opened in the main thread does so by itself. Handlers that the program has set stay.
+
+    Raises:
+        ConfigError: this is not the main thread.
+    """
+    if not is_main_thread():
+        raise ConfigError("handle_signals() has to be called in the main thread")
+    _PROCESS.install()
+    _PROCESS.handled = True
+
+
+def guard_head(head: GuardedHead) -> Callable[[], None]:
+    """Have the signal handlers halt a head until the returned function is called.
+
+    A signal that would end the process raises SystemExit in the main thread, so that its ``with`` blocks are left, and
+    stops the heads of other threads. One that would suspend it does so after all heads are halted, and not at all if a
+    halt fails.
+
+    Raises:
+        ConfigError: this is not the main thread, and `handle_signals` was not called there.
+    """
+    if is_main_thread():
+        _PROCESS.install()
+    elif not _PROCESS.handled:
+        raise ConfigError(
+            "a rig in real time has to be opened in the main thread, where signals halt its head; to open it in "
+            "another thread, call cotarget.handle_signals() in the main thread first"
+        )
+    _PROCESS.heads = [*_PROCESS.heads, head]
+    return lambda: _PROCESS.remove(head)
+
+
+def end_politely() -> Callable[[], None]:
+    """Let signals that would end or suspend the process raise SystemExit, so that ``with`` blocks are left.
 
     Returns:
         A function that removes the handlers.
     """
-    if threading.current_thread() is not threading.main_thread():
-        return lambda: None
+    return _install(dict.fromkeys((*ENDING, *FREEZING), _leave)) if is_main_thread() else lambda: None
 
-    def leave(number: int, frame: FrameType | None) -> None:
-        sys.exit(SHELL_STATUS + number)
 
-    def freeze(number: int, frame: FrameType | None) -> None:
-        assert halt is not None
-        try:
-            halt()
-        except Exception as error:
-            log.error("not suspended, because the head could not be halted: %s", error)
-            return
-        os.kill(os.getpid(), signal.SIGSTOP)
+def is_main_thread() -> bool:
+    """Whether this is the main thread, which alone receives signals."""
+    return threading.current_thread() is threading.main_thread()
 
-    handlers = dict.fromkeys(ENDING, leave) | dict.fromkeys(FREEZING, leave if halt is None else freeze)
-    ours = {number: handler for number, handler in handlers.items() if signal.getsignal(number) is signal.SIG_DFL}
-    for number, handler in ours.items():
-        signal.signal(number, handler)
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    sys.exit(SHELL_STATUS + number)
+
+
+def _install(handlers: Mapping[int, Callable[[int, FrameType | None], None]]) -> Callable[[], None]:
+    """Install signal handlers where the program has set none; return a function that removes them."""
+    previous = {number: signal.getsignal(number) for number in handlers}
+    ours = [number for number, handler in previous.items() if handler in (signal.SIG_DFL, signal.default_int_handler)]
+    for number in ours:
+        signal.signal(number, handlers[number])
 
     def undo() -> None:
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in ours.items():
-                if signal.getsignal(number) is handler:
-                    signal.signal(number, signal.SIG_DFL)
+        if is_main_thread():
+            for number in ours:
+                if signal.getsignal(number) == handlers[number]:
+                    signal.signal(number, previous[number])
 
     return undo
 
@@ -76,7 +170,7 @@ class DeferredSignals:
 
     def defer(self) -> None:
         """Start to defer signals; may be called again if a signal interrupted it."""
-        if threading.current_thread() is not threading.main_thread():
+        if not is_main_thread():
             return
         for number in (signal.SIGINT, *ENDING):
             previous = signal.getsignal(number)

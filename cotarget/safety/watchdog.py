@@ -5,20 +5,24 @@ held during a call of a device, so that a hanging device cannot keep another thr
 reads the stop file on its own thread for the same reason: a file system may hang.
 """
 
+import contextlib
 import logging
 import math
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from cotarget.config import SafetyConfig
 from cotarget.errors import DeviceError, EmergencyStopError
-from cotarget.rig import Clock, PanTilt, PanTiltState
+from cotarget.rig import Clock, PanTilt, PanTiltLimits, PanTiltState
+from cotarget.safety.signals import is_main_thread
 from cotarget.safety.stop_file import StopLook, stop_reason, stopped_by_file
 
 log = logging.getLogger(__name__)
 
 HALT_TRIES = 2  # when the rig is closed; the driver limits the time of each
 AT_GOAL = math.radians(0.1)  # a head that rests within this and a step of its goal has arrived [rad]
+OUTSIDE = math.radians(0.5)  # a head farther beyond its soft limits has left them; a servo's overshoot is less [rad]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +31,14 @@ class Motion:
 
     Attributes:
         goal: pan and tilt [rad].
+        t: time before it was sent, on the rig's clock [s]; an older state says nothing of it.
         halts: number of halts before the command.
         patience_s: how long the device itself may wait for the head to arrive [s]; 0 if it does not wait.
         on_its_way: whether the device's call has not yet returned.
     """
 
     goal: tuple[float, float]
+    t: float
     halts: int
     patience_s: float
     on_its_way: bool = True
@@ -53,10 +59,12 @@ class Watchdog:
 
     Attributes:
         logged: why the head could not be halted, as already logged; empty if it could.
+        in_main_thread: whether the main thread opened the rig, or gave the last command.
     """
 
     def __init__(self, head: PanTilt, clock: Clock, config: SafetyConfig, *, threaded: bool) -> None:
-        self.threaded, self.logged = threaded, ""
+        self.threaded, self.logged, self.in_main_thread = threaded, "", is_main_thread()
+        self._is_inside: bool | None = None  # whether the last state was within the soft limits
         self._head, self._clock = head, clock
         self._timeout_s, self._stop_file = config.watchdog_s, config.stop_file
         self._look = StopLook(config.stop_file)  # unused without a watching thread: time passes only inside calls then
@@ -87,8 +95,9 @@ class Watchdog:
                 raise DeviceError("the rig is closed, so the head does not move any more")
             if self._owed is not None:
                 raise DeviceError(f"the head does not move before it could be halted: {self._owed}")
-            self._motion = Motion(goal, halts, patience_s)
             self._alive_at = self._clock.now()
+            self._motion = Motion(goal, self._alive_at, halts, patience_s)
+            self.in_main_thread = is_main_thread()
             return self._motion
 
     def end(self, motion: Motion, arrived: bool) -> bool:
@@ -115,15 +124,28 @@ class Watchdog:
         if not self.threaded:
             self.watch()
 
-    def saw(self, state: PanTiltState, step: float) -> None:
-        """Register a state of the head; a head that rests at its goal ends the motion."""
+    def saw(self, state: PanTiltState, limits: PanTiltLimits) -> None:
+        """Register a state: rest at the goal ends the motion, and a position beyond the soft limits stops the head."""
+        self._check_inside(state, limits)
         with self._lock:
             motion = self._motion
-            if motion is None or motion.on_its_way or state.moving:
+            if motion is None or motion.on_its_way or state.moving or state.t < motion.t:
                 return
             off = max(abs(state.pan - motion.goal[0]), abs(state.tilt - motion.goal[1]))
-            if off <= step + AT_GOAL:
+            if off <= limits.step + AT_GOAL:
                 self._motion = None
+
+    def _check_inside(self, state: PanTiltState, limits: PanTiltLimits) -> None:
+        """Stop a head that was within the soft limits and is not any more; warn of one that is outside of them."""
+        off = max(max(low - q, q - high) for q, (low, high) in ((state.pan, limits.pan), (state.tilt, limits.tilt)))
+        was_inside, self._is_inside = self._is_inside, off <= limits.step + OUTSIDE
+        if self._is_inside or was_inside is False:
+            return
+        place = f"pan {math.degrees(state.pan):.1f}, tilt {math.degrees(state.tilt):.1f} degrees"
+        if was_inside:
+            self.stop(f"the head left its soft limits: it is at {place}")
+        else:
+            log.warning("the head stands beyond its soft limits, at %s; the next command leads it inside", place)
 
     def deadline(self) -> float | None:
         """Return when the head is halted without a sign of life, on the rig's clock [s]; None while it rests."""
@@ -176,6 +198,17 @@ class Watchdog:
                 self._owed = str(error)
             raise
         self._rests(motion)
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Halt the head, and let no command of another thread begin in the block.
+
+        Raises:
+            Exception: as the device raised it.
+        """
+        with self._lock:
+            self.halt()
+            yield
 
     def stop(self, reason: str) -> None:
         """Halt the head, and refuse moves until `clear`."""

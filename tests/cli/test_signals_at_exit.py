@@ -210,6 +210,72 @@ def test_hanging_device_does_not_prevent_ctrl_c(start):
     assert returned == -signal.SIGINT
 
 
+# Two rigs, each in a thread of its own or in the main thread, whose heads get commands and frames all the time.
+TWO_RIGS = """
+import itertools, os, threading, time
+import cotarget
+from cotarget.config import SafetyConfig
+from cotarget.errors import CotargetError
+from tests.support.rigs import guarded
+from tests.support.safety_rigs import RealDevices
+
+def run(number):
+    rig = RealDevices()
+    def noted(name, act):
+        def call(*arguments):
+            os.write(1, f"{number} {name}\\n".encode())  # whole lines from several threads
+            return act(*arguments)
+        return call
+    rig.head.move, rig.head.halt = noted("move", rig.head.move), noted("halt", rig.head.halt)
+    try:
+        with guarded(rig, SafetyConfig()) as safe:
+            for k in itertools.count():
+                safe.head.move(0.1 * (k % 5), 0.0)
+                time.sleep(0.02)
+    except CotargetError as error:
+        os.write(1, f"{number} {error}\\n".encode())
+"""
+IN_THREADS = """
+cotarget.handle_signals()
+for number in (1, 2):
+    threading.Thread(target=run, args=(number,)).start()
+time.sleep(1000)
+"""
+IN_BOTH = """
+cotarget.handle_signals()
+threading.Thread(target=run, args=(1,)).start()
+run(2)
+"""
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("where", [IN_THREADS, IN_BOTH], ids=["threads", "a thread and the main thread"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGTSTP])
+def test_a_signal_halts_the_heads_of_all_threads(start, where, number):
+    child = start(TWO_RIGS + where)
+    for rig in "12":
+        child.wait_for(f"{rig} move")
+    child.signal(number)
+    if number == signal.SIGTSTP:
+        child.wait_until_suspended()
+        os.set_blocking(child.process.stdout.fileno(), False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                child.rest += os.read(child.process.stdout.fileno(), 65536)
+        child.lines += child.rest.decode().splitlines()
+    else:
+        child.finish()
+    for rig in "12":
+        assert [line for line in child.lines if line in (f"{rig} move", f"{rig} halt")][-1] == f"{rig} halt"
+
+
+def test_a_rig_in_a_thread_is_refused_without_handlers_in_the_main_thread(start):
+    child = start(TWO_RIGS + "thread = threading.Thread(target=run, args=(1,)); thread.start(); thread.join()")
+    returned, (line,), _ = child.finish()
+    assert returned == 0
+    assert "cotarget.handle_signals()" in line
+
+
 def test_unclosed_rig_is_halted_at_exit(start):
     child = start(PROGRAM + "safe = guarded(rig, SafetyConfig(watchdog_s=1000.0))\nsafe.head.move(0.5, 0.0)")
     returned, lines, err = child.finish()

@@ -78,7 +78,7 @@ def test_no_command_leaves_the_limits_or_exceeds_the_cap(step, soft):
     cap = math.radians(min(soft.speed_deg_s or 149.0, 149.0))
     safe = guarded(Devices(head), soft).head
     edges = [e + d for limits in allowed for e in limits for d in (-1e-3, -1e-12, 0.0, 1e-12, 1e-3)]
-    commands = [*rng.uniform(-7, 7, (3000, 2)), *((p, t) for p in edges for t in edges), (math.inf, -math.inf)]
+    commands = [*rng.uniform(-7, 7, (3000, 2)), *((p, t) for p in edges for t in edges)]
     for pan, tilt in commands:
         speed = None if rng.random() < 0.3 else rng.uniform(0.01, 10)
         said = safe.move(pan, tilt, speed)
@@ -112,7 +112,7 @@ def test_every_command_is_done_within_the_limits_or_refused(step):
     for pan, tilt in itertools.product(AWKWARD, AWKWARD):
         for speed in SPEEDS:
             head.log.clear()
-            good = not math.isnan(pan) and not math.isnan(tilt) and (speed is None or speed > 0)
+            good = math.isfinite(pan) and math.isfinite(tilt) and (speed is None or speed > 0)
             if not good:
                 with pytest.raises(DeviceError, match="head"):
                     safe.move(pan, tilt, speed)
@@ -123,6 +123,32 @@ def test_every_command_is_done_within_the_limits_or_refused(step):
             assert inside(done_pan, pan_limits)
             assert inside(done_tilt, LIMITS.tilt)
             assert 0 < done_speed <= cap + ROUNDING
+
+
+@pytest.mark.parametrize(("change", "key"), [
+    ({"pan": (math.nan, 1.0)}, r"safety\.pan_deg"),
+    ({"tilt": (-1.0, math.nan)}, r"safety\.tilt_deg"),
+    ({"tilt": (1.0, -1.0)}, r"safety\.tilt_deg"),
+    ({"pan": (-math.inf, math.inf)}, r"safety\.pan_deg"),  # an endless axis needs soft limits
+    ({"speed": math.nan}, "speed of nan"),
+    ({"acceleration": math.nan}, "acceleration of nan"),
+    ({"step": math.nan}, "step of nan"),
+])  # fmt: skip
+def test_a_head_without_usable_limits_is_refused(change, key):
+    rig = Devices(Head(replace(LIMITS, **change)))
+    with pytest.raises(ConfigError, match=key):
+        guarded(rig, SafetyConfig())
+    assert rig.closed
+    endless = Devices(Head(replace(LIMITS, pan=(-math.inf, math.inf))))
+    assert guarded(endless, SafetyConfig(pan_deg=(-90.0, 90.0))).head.limits.pan == (-math.pi / 2, math.pi / 2)
+
+
+@pytest.mark.parametrize("focal_px", [math.nan, math.inf])
+def test_a_focal_length_that_is_not_finite_is_refused(focal_px):
+    rig = Devices()
+    rig.zoom = SimpleNamespace(size=(2, 2), zoom=lambda focal: pytest.fail("the lens moved"))
+    with pytest.raises(DeviceError, match="focal length"):
+        guarded(rig, SafetyConfig()).zoom.zoom(focal_px)
 
 
 @pytest.mark.parametrize("said", [(1.9, 0.0), (0.0, -1.5), (math.nan, 0.0)])

@@ -139,6 +139,38 @@ def test_a_head_that_rests_off_its_goal_is_watched(rig, safe, goal):
     assert rig.head.halts == [pytest.approx(WATCHDOG_S, abs=EXACT)]
 
 
+def test_a_state_from_before_the_command_does_not_end_its_watch(rig, safe):
+    """As of a head that is polled over a network: its last state shows rest where it is sent to again."""
+    safe.clock.sleep_until(1.0)
+    rig.head.state = lambda: PanTiltState(0.0, 0.0, moving=False, t=0.9)
+    safe.head.move(0.0, 0.0)
+    safe.head.state()
+    safe.clock.sleep_until(10.0)
+    assert rig.head.halts == [pytest.approx(1.0 + WATCHDOG_S, abs=EXACT)]
+
+
+@pytest.mark.parametrize("outside", [(1.2, 0.0), (0.0, -0.6)])
+def test_a_head_that_leaves_its_soft_limits_is_stopped(rig, outside, caplog):
+    limits = SafetyConfig(pan_deg=(-60.0, 60.0), tilt_deg=(-30.0, 30.0))
+    pose = outside
+    rig.head.state = lambda: PanTiltState(*pose, moving=False, t=rig.clock.now())
+    with guarded(rig, limits) as safe:
+        safe.head.state()  # from the start, as after the limits were narrowed: it may be led inside
+        assert "stands beyond its soft limits" in caplog.text
+        safe.head.move(0.0, 0.0)
+        pose = (0.0, 0.0)
+        safe.head.state()
+        assert not rig.head.halts
+        pose = outside
+        safe.head.state()
+        assert len(rig.head.halts) == 1
+        with pytest.raises(EmergencyStopError, match="left its soft limits"):
+            safe.head.move(0.0, 0.0)
+        safe.clear()
+        safe.head.state()
+        safe.head.move(0.0, 0.0)
+
+
 def test_a_head_that_passes_its_goal_is_watched(rig, safe):
     """A moving head is sent to where it is: it is at its goal, and overshoots."""
     safe.head.move(FAR, 0.0)
