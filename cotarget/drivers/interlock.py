@@ -53,7 +53,7 @@ class PositionLostMarker:
         self._has_lasting_port = not port.startswith("/dev/pts/")  # another emulator gets a pseudo-terminal's name
         port = re.sub(r"[^A-Za-z0-9.]+", "-", port).strip("-")[-LONGEST_NAME:]
         without = _state_home() / WITHOUT_STOP_FILE
-        beside = without if stop_file is None else stop_file
+        beside = without if stop_file is None else stop_file.absolute()
         self._folder, self._begin = beside.parent, f"{beside.name}."
         self.file = self._folder / f"{self._begin}{port}{SUFFIX}"
         self._of_port = without.with_name(f"{without.name}.{port}{SUFFIX}")
@@ -106,7 +106,7 @@ class PositionLostMarker:
 
 
 def _state_home() -> Path:
-    return Path(os.environ.get(STATE_HOME) or STATE_HOME_DEFAULT).expanduser()
+    return Path(os.environ.get(STATE_HOME) or STATE_HOME_DEFAULT).expanduser().absolute()
 
 
 def _reason(file: Path) -> str:

@@ -27,9 +27,10 @@ def locate_stop_file(rig: Path, backend: object, said: object) -> Path | None:
         said: its `stop_file`; None where it has none, and False to do without one.
 
     Returns:
-        The path; None for none. By default a rig of real devices has RIG.stop beside rig.toml, or beside the file that
+        The path, absolute, because the program may change its working directory; None for none. By default a rig of real devices has RIG.stop beside rig.toml, or beside the file that
         rig.toml links to, and another rig has none.
     """
+    rig = rig.absolute()
     if said is None:
         if backend != "hardware":
             return None
@@ -61,7 +62,7 @@ def find_stop_file(rig: Path) -> Path:
     if not isinstance(said, str | None) and said is not False:
         raise ConfigError(f'{rig}: safety.stop_file: {said!r} is not a text; name a file, as "stop"')
     path = locate_stop_file(rig, backend, said)
-    if path is None or path.name in ("", "..") or path == rig.parent:
+    if path is None or path.name in ("", "..") or path == rig.absolute().parent:
         raise ConfigError(f'{rig}: has no stop file; give one: [safety] stop_file = "stop"')
     return path
 

@@ -66,8 +66,9 @@ class Watchdog:
         self.threaded, self.logged, self.in_main_thread = threaded, "", is_main_thread()
         self._is_inside: bool | None = None  # whether the last state was within the soft limits
         self._head, self._clock = head, clock
-        self._timeout_s, self._stop_file = config.watchdog_s, config.stop_file
-        self._look = StopLook(config.stop_file)  # unused without a watching thread: time passes only inside calls then
+        self._timeout_s = config.watchdog_s
+        self._stop_file = config.stop_file and config.stop_file.absolute()  # the program may change its directory
+        self._look = StopLook(self._stop_file)  # unused without a watching thread: time passes only inside calls then
         self._lock = threading.RLock()  # reentrant: a signal handler may call stop() anywhere
         self._motion: Motion | None = None
         self._alive_at = -math.inf

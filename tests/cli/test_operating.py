@@ -93,8 +93,10 @@ def test_missing_folder_of_the_stop_file_fails_stop_and_point(folder, capsys):
     (folder / "broken.toml").write_text('[safety]\nstop_file = "run/stop\n')
     assert "broken.toml: " in refused(capsys, "stop", "--rig", "broken.toml")
     (folder / "run").rmdir()
-    assert refused(capsys, "stop", "--rig", "stops.toml").startswith("cotarget stop: run/stop: NOT stopped: ")
-    assert refused(capsys, "point", "--rig", "stops.toml").startswith("cotarget point: run/stop: ")
+    assert refused(capsys, "stop", "--rig", "stops.toml").startswith(
+        f"cotarget stop: {folder / 'run/stop'}: NOT stopped: "
+    )
+    assert refused(capsys, "point", "--rig", "stops.toml").startswith(f"cotarget point: {folder / 'run/stop'}: ")
     assert not (folder / "run").exists()
 
 

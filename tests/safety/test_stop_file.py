@@ -7,6 +7,7 @@ import pytest
 
 from cotarget.backends import load_config
 from cotarget.config import SafetyConfig
+from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 from cotarget.safety.stop_file import clear_stop_file, find_stop_file, refuse_if_stopped, stop_reason, write_stop_file
 from tests.support.rigs import guarded
@@ -40,6 +41,26 @@ def test_a_link_to_a_rig_has_the_stop_file_of_the_rig(tmp_path):
     link = tmp_path / "calib.toml"
     link.symlink_to(tmp_path / "roof.toml")
     assert load_config(link).safety.stop_file == find_stop_file(link) == find_stop_file(tmp_path / "roof.toml")
+
+
+def test_a_change_of_the_working_directory_changes_neither_stop_file_nor_marker(tmp_path, monkeypatch):
+    """As a notebook or a user's driver may do; nor the files that rig.toml names."""
+    monkeypatch.chdir(tmp_path)
+    Path("elsewhere").mkdir()
+    Path("roof.toml").write_text(HARDWARE + "[targets.book]\ntemplate = 'book.png'\ndetector = 'colour'\n")
+    config = load_config("roof.toml")
+    made = SafetyConfig(stop_file=Path("made.stop"))
+    lost = PositionLostMarker("/dev/pts/7", made.stop_file)
+    with guarded(SimulatedDevices(), config.safety) as read, guarded(SimulatedDevices(), made) as by_hand:
+        monkeypatch.chdir("elsewhere")
+        lost.note("it stalled")
+        assert (tmp_path / "made.stop.dev-pts-7.position-lost").exists()
+        for rig, name in ((read, "roof.stop"), (by_hand, "made.stop")):
+            (tmp_path / name).write_text("on the roof")
+            assert rig.stopped == "on the roof"
+            with pytest.raises(EmergencyStopError):
+                rig.head.move(0.1, 0.0)
+    assert config.target("book").template == tmp_path / "book.png"
 
 
 def test_an_incomplete_stop_file_line_is_refused(tmp_path):
