@@ -1,6 +1,8 @@
 """Read, check and open the rig that a rig.toml describes; the only module that imports backends."""
 
+import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,13 +68,14 @@ def _check_times(config: "RigConfig") -> None:
             )
 
 
-def open_rig(config: "RigConfig | Path | str", guarded: bool = True) -> Rig:
+def open_rig(config: "RigConfig | Path | str", guarded: bool = True, *, file: Path | None = None) -> Rig:
     """Open a rig with the safety layer in front of it: limits, watchdog and stop file.
 
     Args:
         config: a configuration, or the path of a rig.toml.
         guarded: whether the safety layer is in front; without it, a caller can put a recorder between the two and call
             `cotarget.safety.safe_rig.guard` itself.
+        file: the rig.toml that a configuration is from; no second program may open its real devices.
 
     Raises:
         ConfigError: the configuration is malformed, or lacks a key that the rig needs.
@@ -82,9 +85,23 @@ def open_rig(config: "RigConfig | Path | str", guarded: bool = True) -> Rig:
     from cotarget.safety.safe_rig import guard
 
     if isinstance(config, str | Path):
-        config = load_config(Path(config))
-    rig = OPENERS[config.backend](config)
+        file = Path(config)
+        config = load_config(file)
+    rig = _open_locked(config, file)
     return guard(rig, config.safety) if guarded else rig
+
+
+def _open_locked(config: "RigConfig", file: Path | None) -> Rig:
+    """Open a rig; that of real devices has the lock of its rig.toml until it is released."""
+    if config.backend != "hardware" or file is None:
+        return OPENERS[config.backend](config)
+    from cotarget.drivers.interlock import rig_lock
+
+    with contextlib.ExitStack() as opened:
+        opened.enter_context(rig_lock(file=file))
+        rig = OPENERS[config.backend](config)
+        opened.callback(rig.release)
+        return replace(rig, release=opened.pop_all().close)
 
 
 def _open_simulation(config: "RigConfig") -> Rig:
@@ -136,8 +153,6 @@ def describe(config: "RigConfig") -> RigSpec:
     Raises:
         ConfigError: the soft limits leave nothing of the head's range, or a recording cannot be read.
     """
-    from dataclasses import replace
-
     from cotarget.safety.safe_rig import soft_limits
 
     spec = _described(config)

@@ -53,7 +53,7 @@ def open_named(path: Path, config: "RigConfig", guarded: bool = True) -> "Rig":
     from cotarget.backends import open_rig
 
     with naming(path):
-        return open_rig(config, guarded)
+        return open_rig(config, guarded, file=path)
 
 
 def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:

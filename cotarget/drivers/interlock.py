@@ -1,6 +1,7 @@
 """Locks of the hardware rig: one program at a time, and no motion of a head whose position may be lost.
 
-`rig_lock` refuses a second program before either one blames the devices for the other's commands.
+`rig_lock` refuses a second program before either one blames the devices for the other's commands, by the head's address
+and by the rig.toml.
 
 `PositionLostMarker` stores from one program to the next that the position of a PTU-D46 may be lost. A unit that hit a
 limit, stalled or was switched off goes on counting from a wrong position, and no later answer shows it: its limits, and
@@ -19,6 +20,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from cotarget.drivers.serial_line import InUseError
 from cotarget.errors import DeviceError
@@ -51,12 +53,12 @@ class PositionLostMarker:
 
     def __init__(self, port: str, stop_file: Path | None) -> None:
         self._has_lasting_port = not port.startswith("/dev/pts/")  # another emulator gets a pseudo-terminal's name
-        port = re.sub(r"[^A-Za-z0-9.]+", "-", port).strip("-")[-LONGEST_NAME:]
+        names = [re.sub(r"[^A-Za-z0-9.]+", "-", each).strip("-")[-LONGEST_NAME:] for each in (port, *_identities(port))]
         without = _state_home() / WITHOUT_STOP_FILE
         beside = without if stop_file is None else stop_file.absolute()
         self._folder, self._begin = beside.parent, f"{beside.name}."
-        self.file = self._folder / f"{self._begin}{port}{SUFFIX}"
-        self._of_port = without.with_name(f"{without.name}.{port}{SUFFIX}")
+        self.file = self._folder / f"{self._begin}{names[0]}{SUFFIX}"
+        self._of_port = [without.with_name(f"{without.name}.{name}{SUFFIX}") for name in dict.fromkeys(names)]
 
     def refuse(self) -> None:
         """Raise if there is a marker for any unit of this rig, or for the unit at this port.
@@ -73,12 +75,12 @@ class PositionLostMarker:
                 f"{self._folder}: cannot be read, where it would say that the head's position is lost: {error.strerror}"
             ) from None
         found = [file for file in files if file.name.startswith(self._begin) and file.name.endswith(SUFFIX)]
-        for file in (*found, *([self._of_port] if self._of_port.exists() else [])):
+        for file in (*found, *(file for file in self._of_port if file.exists())):
             raise DeviceError(f"{_reason(file)} (or, where no unit is at that port any more, remove {file})")
 
     def note(self, reason: str) -> None:
         """Write the markers; a failure is logged."""
-        for file in dict.fromkeys((self.file, self._of_port) if self._has_lasting_port else (self.file,)):
+        for file in dict.fromkeys((self.file, *self._of_port) if self._has_lasting_port else (self.file,)):
             try:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(f"{reason}\n", encoding="utf-8")
@@ -96,7 +98,7 @@ class PositionLostMarker:
         Raises:
             DeviceError: the file cannot be removed.
         """
-        for file in (self.file, self._of_port):
+        for file in (self.file, *self._of_port):
             try:
                 file.unlink(missing_ok=True)
             except NotADirectoryError:
@@ -118,26 +120,70 @@ def _reason(file: Path) -> str:
     return "".join(c if c.isprintable() else " " for c in said.strip())[:LONGEST_REASON] or NO_REASON
 
 
+# Ports that a URL may leave out.
+DEFAULT_PORTS = (None, 80, 443)
+
+
+def _identities(address: str) -> list[str]:
+    """List names of a device that are equal however its address is written.
+
+    Args:
+        address: a serial port, HOST, HOST:PORT or a URL.
+
+    Returns:
+        The resolved path of a port that exists. One name for each IP address of the host, with its port and path; all
+        addresses of this machine are one. Empty for a port that does not exist, which needs no name.
+    """
+    if "://" not in address and (address.startswith("/") or Path(address).exists()):
+        return [str(Path(address).resolve())] if Path(address).exists() else []
+    try:
+        url = urlsplit(address if "://" in address else f"//{address}")
+        host, port = url.hostname, url.port
+    except ValueError:  # a URL of another form
+        return [address]
+    if not host:
+        return []
+    try:
+        found = {str(each[4][0]) for each in socket.getaddrinfo(host, None)}
+    except (OSError, UnicodeError):  # the device cannot be opened by this name
+        found = {host}
+    end = ("" if port in DEFAULT_PORTS else f":{port}") + url.path.rstrip("/") + (url.query and f"?{url.query}")
+    return sorted({("localhost" if _is_own(each) else each) + end for each in found})
+
+
+def _is_own(address: str) -> bool:
+    """Whether an IP address is one of this machine."""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM) as tried:
+            tried.bind((address, 0))
+    except OSError:
+        return False
+    return True
+
+
 @contextlib.contextmanager
-def rig_lock(port: str) -> Iterator[None]:
-    """Lock the rig whose pan-tilt unit is at a port; the lock ends with the block, or with the process in any way.
+def rig_lock(*addresses: str, file: Path | None = None) -> Iterator[None]:
+    """Lock a rig by its head and its file; the lock ends with the block, or with the process in any way.
 
     The lock is an abstract socket name, which Linux gives to one socket of a machine at a time. On other systems, and
     between containers, only the ports and cameras themselves refuse a second program.
 
+    Args:
+        addresses: of the pan-tilt unit: a serial port, HOST, HOST:PORT or a URL.
+        file: the rig.toml; None for a rig without one.
+
     Raises:
         InUseError: another program has the lock.
     """
-    url = "://" in port
-    if not sys.platform.startswith("linux") or not (url or (port and Path(port).exists())):
-        yield  # a port that does not exist needs no lock, and a head without one has none
-        return
-    address = port if url else str(Path(port).resolve())
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
-        try:
-            name.bind(f"\0cotarget rig {hashlib.sha256(address.encode()).hexdigest()}")
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                there = f"the rig with the pan-tilt unit at {port}"
-                raise InUseError(f"another program has {there}; end it first") from None
+    names = {name: f"the rig with the pan-tilt unit at {each}" for each in addresses for name in _identities(each)}
+    if file is not None:
+        names[f"file {file.resolve()}"] = f"the rig of {file}"
+    with contextlib.ExitStack() as locks:
+        for name, rig in names.items() if sys.platform.startswith("linux") else ():
+            lock = locks.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+            try:
+                lock.bind(f"\0cotarget rig {hashlib.sha256(name.encode()).hexdigest()}")
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    raise InUseError(f"another program has {rig}; end it first") from None
         yield

@@ -33,6 +33,7 @@ from cotarget.schema import missing_key, validate
 # Measurements: docs/design-notes.md.
 SWITCH_INTERVAL = 5e-4
 KEY = "driver"
+ADDRESS_KEYS = ("port", "host", "url", "address")  # of settings that say where a device is
 
 
 def _is_frame(answer: object) -> bool:
@@ -122,6 +123,15 @@ class Device:
             raise ConfigError(f"{self.where}.{KEY}: spec of its Settings is no {wanted.__name__} of cotarget.rig")
         return spec
 
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """The addresses in the settings: a serial port, HOST:PORT or a URL, whatever the key."""
+        named = {key: getattr(self.settings, key, "") for key in ADDRESS_KEYS}
+        if named["host"] and named["port"]:
+            named |= {"host": f"{named['host']}:{named['port']}", "port": ""}
+        urls = [value for value in vars(self.settings).values() if isinstance(value, str) and "://" in value]
+        return tuple(dict.fromkeys(str(each) for each in (*named.values(), *urls) if each))
+
     def refuse_missing(self) -> None:
         """Refuse settings that lack what opening the device needs.
 
@@ -145,7 +155,8 @@ class Device:
             raise ConfigError("is not configured")
         if not hasattr(self.driver, "probe"):
             return "is not asked: its driver has no probe"
-        with calling(self.where):
+        lock = rig_lock(*self.addresses) if self.own and self.role == "head" else contextlib.nullcontext()
+        with lock, calling(self.where):
             return str(self.driver.probe(self.settings))
 
     def open(self, *arguments: Any) -> Any:
@@ -254,7 +265,7 @@ def open_hardware(config: RigConfig) -> Rig:
     sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
     clock, spec = MonotonicClock(), _spec(found)
     with contextlib.ExitStack() as opened:
-        opened.enter_context(rig_lock(port_of(found["head"])))
+        opened.enter_context(rig_lock(*found["head"].addresses))
         board = opened.enter_context(contextlib.closing(make_board(board_settings(config.hardware))))
         fixed = opened.enter_context(contextlib.closing(found["fixed"].open(clock)))
         zoom = opened.enter_context(contextlib.closing(found["zoom"].open(clock)))

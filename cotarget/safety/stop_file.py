@@ -27,8 +27,8 @@ def locate_stop_file(rig: Path, backend: object, said: object) -> Path | None:
         said: its `stop_file`; None where it has none, and False to do without one.
 
     Returns:
-        The path, absolute, because the program may change its working directory; None for none. By default a rig of real devices has RIG.stop beside rig.toml, or beside the file that
-        rig.toml links to, and another rig has none.
+        The path, absolute, because the program may change its working directory; None for none. By default a rig of
+        real devices has RIG.stop beside rig.toml, or beside the file that rig.toml links to, and another rig has none.
     """
     rig = rig.absolute()
     if said is None:

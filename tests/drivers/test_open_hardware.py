@@ -14,8 +14,9 @@ from cotarget.drivers import rig as rig_module
 from cotarget.drivers.axis import AxisSettings
 from cotarget.drivers.board import BoardSettings
 from cotarget.drivers.gphoto_camera import GphotoSettings
+from cotarget.drivers.interlock import rig_lock
 from cotarget.drivers.ptu_d46 import D46Head, D46Settings
-from cotarget.drivers.rig import open_hardware
+from cotarget.drivers.rig import device_of, open_hardware
 from cotarget.drivers.serial_line import InUseError
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.plugins import load
@@ -130,13 +131,19 @@ def port():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the devices have to refuse a second program")
-@pytest.mark.parametrize("by", ["its name", "another name", "a URL"])
+@pytest.mark.parametrize("by", ["its name", "another name", "a URL", "a name of this machine", "its default address"])
 def test_a_rig_in_use_is_refused_before_a_device_is_opened(devices, port, tmp_path, by):
     """Within one process as well; and the claim ends with the rig."""
     log, missing, _ = devices
     (tmp_path / "link").symlink_to(port)
     address = f"socket://192.0.2.1:{os.getpid()}"  # of no other test's process
-    names = {"its name": (port, port), "another name": (port, str(tmp_path / "link")), "a URL": (address, address)}[by]
+    names = {
+        "its name": (port, port),
+        "another name": (port, str(tmp_path / "link")),
+        "a URL": (address, address),
+        "a name of this machine": (f"socket://localhost:{os.getpid()}", f"socket://127.0.0.1:{os.getpid()}"),
+        "its default address": (f"socket://0.0.0.0:{os.getpid()}", f"socket://LocalHost:{os.getpid()}/"),
+    }[by]
     first, second = (
         dataclasses.replace(CONFIG, hardware=dataclasses.replace(CONFIG.hardware, head={"port": name}))
         for name in names
@@ -153,6 +160,59 @@ def test_a_rig_in_use_is_refused_before_a_device_is_opened(devices, port, tmp_pa
         open_hardware(second)
     missing.clear()
     open_hardware(second).close()
+
+
+OWN_HEAD = """
+import dataclasses
+from cotarget.rig import HeadSpec, PanTiltLimits
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    host: str = ""
+    port: int = 0
+    dome_url: str = ""
+    spec = HeadSpec(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), 1.0, 1.0, 0.0), 0.0)
+
+class Head:
+    def probe(settings):
+        return "asked"
+
+Head.Settings = Settings
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the devices have to refuse a second program")
+@pytest.mark.parametrize(("table", "other"), [
+    ({"host": "192.0.2.1"}, {"host": "192.0.2.1", "port": 80}),
+    ({"host": "127.0.0.1", "port": 4001}, {"host": "localhost", "port": 4001}),
+    ({"dome_url": "http://192.0.2.1/ptz"}, {"dome_url": "http://192.0.2.1:80/ptz/"}),
+])  # fmt: skip
+def test_a_head_of_ones_own_is_locked_by_its_address_whatever_the_key(tmp_path, table, other):
+    (tmp_path / "own.py").write_text(OWN_HEAD)
+    driver = {"driver": f"{tmp_path}/own.py:Head"}
+    first, second = (device_of("head", driver | each) for each in (table, other))
+    with rig_lock(*first.addresses):
+        with pytest.raises(InUseError):
+            second.probe()
+        assert device_of("head", driver | {"host": "192.0.2.1", "port": 4002}).probe() == "asked"
+    assert second.probe() == "asked"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the devices have to refuse a second program")
+def test_one_rig_toml_is_opened_once(devices, tmp_path, monkeypatch):
+    """Whatever its head says of its address, and however the file is named."""
+    log, *_ = devices
+    (tmp_path / "rig.toml").write_text(
+        'backend = "hardware"\n[hardware]\nhead.port = "/dev/null/head"\nfixed.url = "http://192.0.2.1"\n'
+        'zoom.port = "usb:"\n'
+    )
+    (tmp_path / "link.toml").symlink_to("rig.toml")
+    with open_rig(tmp_path / "rig.toml", guarded=False):
+        log.clear()
+        with pytest.raises(InUseError, match=r"link\.toml"):
+            open_rig(tmp_path / "link.toml", guarded=False)
+        assert log == []
+    open_rig(str(tmp_path / "link.toml"), guarded=False).close()
 
 
 @pytest.mark.parametrize("which", ORDER)
