@@ -29,10 +29,10 @@ RENDER_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check: whether it is well, what was found, and the command that fixes it."""
+    """Result of one check: whether it is well (None: unknown), what was found, and the command that fixes it."""
 
     name: str
-    ok: bool
+    ok: bool | None
     text: str
     fix: str = ""
 
@@ -208,9 +208,14 @@ def _devices(config: "RigConfig", rig: Path) -> list[Finding]:
     ]
 
 
-def _ask(name: str, ask: Callable[[], str], there: str, rig: Path) -> Finding:
+def _ask(name: str, ask: Callable[[], str | None], there: str, rig: Path) -> Finding:
     try:
-        return Finding(name, True, ask())
+        said = ask()
+        return (
+            Finding(name, True, said)
+            if said is not None
+            else Finding(name, None, "is not asked: its driver has no probe")
+        )
     except CotargetError as error:
         return Finding(name, False, str(error), _fix(error, name, there, rig))
 

@@ -28,7 +28,7 @@ from cotarget.config import BoardConfig
 from cotarget.control.controller import reach_of
 from cotarget.errors import CalibrationError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, pose
-from cotarget.rig import Camera, Frame, Image, PanTiltState, Rig
+from cotarget.rig import Camera, Frame, Image, PanTiltState, Rig, refuse_outside
 from cotarget.targeting import aim
 
 log = logging.getLogger(__name__)
@@ -217,10 +217,12 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
 
     Raises:
         CalibrationError: the image does not move with the head: it has no structure, or something in it moves.
+        DeviceError: the head stands beyond its limits.
         StaleFrameError: frames stopped coming.
     """
-    _zoom_out(rig)
     home = rig.head.state()
+    refuse_outside(home, rig.head.limits)
+    _zoom_out(rig)
     try:
         return _wiggle(rig, (home.pan, home.tilt), seconds)
     except CalibrationError as error:

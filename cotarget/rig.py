@@ -5,7 +5,8 @@ advances the rig's own clock, which is simulated time in the simulation.
 """
 
 import json
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
@@ -96,6 +97,22 @@ class PanTiltLimits:
         """Whether angles [rad] are within the limits; nan is not."""
         pan, tilt = np.asarray(pan, dtype=float), np.asarray(tilt, dtype=float)
         return np.asarray((pan >= self.pan[0]) & (pan <= self.pan[1]) & (tilt >= self.tilt[0]) & (tilt <= self.tilt[1]))
+
+
+def refuse_outside(state: PanTiltState, limits: PanTiltLimits, axes: Sequence[str] = ("pan", "tilt")) -> None:
+    """Refuse a head that stands beyond its limits, where each command would move these axes.
+
+    Raises:
+        DeviceError: an axis is beyond its limits by more than a step.
+    """
+    for axis in axes:
+        angle, (low, high) = getattr(state, axis), getattr(limits, axis)
+        if not low - limits.step <= angle <= high + limits.step:
+            raise DeviceError(
+                f"the head stands at {axis} {math.degrees(angle):.1f} degrees, beyond the limits of "
+                f"{math.degrees(low):.1f} to {math.degrees(high):.1f}, and would move inside; if it may, do so first "
+                f"by cotarget point --{axis}-deg"
+            )
 
 
 @dataclass(frozen=True)

@@ -177,6 +177,7 @@ def test_commands_and_doctor_use_own_devices(rig, capsys, monkeypatch):
     found = {finding.name: finding for finding in examine(load_config(rig))}
     assert found["hardware.fixed"].text == "a green wall"
     assert found["hardware.head"].text == "is not asked: its driver has no probe"
+    assert found["hardware.head"].ok is None  # unknown, and neither well nor missing
     assert found["targets.wall.detector"].ok
 
 

@@ -24,6 +24,7 @@ from cotarget.errors import CalibrationError, ConfigError
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig, TargetProfile
+    from cotarget.drivers.rig import Device
     from cotarget.targeting import Aim, WantedSize
 
 
@@ -293,6 +294,7 @@ def point_command(options: argparse.Namespace) -> None:
     from cotarget.backends import load_config
     from cotarget.calibration.captures import write_image
     from cotarget.calibration.recorder import wait_for_lens
+    from cotarget.rig import refuse_outside
     from cotarget.safety.stop_file import refuse_if_stopped
 
     config = load_config(options.rig)
@@ -310,16 +312,17 @@ def point_command(options: argparse.Namespace) -> None:
             if angle is not None:
                 low, high = map(math.degrees, bounds)
                 check_within(option, angle, (low, high), "the head's {} degrees", math.degrees(limits.step))
+        now, asked = rig.head.state(), {"pan": options.pan_deg, "tilt": options.tilt_deg}
+        moves = any(angle is not None for angle in asked.values())
+        if moves:
+            refuse_outside(now, limits, [axis for axis, angle in asked.items() if angle is None])
         if options.focal_mm is not None:
             shortest, longest = (focal * rig.spec.zoom.pitch_mm for focal in rig.zoom.focal_range)
             check_within("--focal-mm", options.focal_mm, (shortest, longest), "the lens's {} mm")
             rig.zoom.zoom(options.focal_mm / rig.spec.zoom.pitch_mm)
-        now = rig.head.state()
-        pan, tilt = (
-            here if wanted is None else math.radians(wanted)
-            for wanted, here in ((options.pan_deg, now.pan), (options.tilt_deg, now.tilt))
-        )
-        rig.head.move(pan, tilt, wait=True)
+        if moves:  # an axis that is not asked for is sent to where it stands
+            pan, tilt = (getattr(now, axis) if angle is None else math.radians(angle) for axis, angle in asked.items())
+            rig.head.move(pan, tilt, wait=True)
         wait_for_lens(rig)
         head, lens = rig.head.state(), rig.zoom.state()
         for name, path in shots.items():
@@ -358,6 +361,7 @@ def reset_head_command(options: argparse.Namespace) -> None:
     """Run `cotarget reset-head`: reset the pan-tilt unit after consent."""
     from cotarget.backends import load_config
     from cotarget.drivers.clock import MonotonicClock
+    from cotarget.drivers.interlock import rig_lock
     from cotarget.drivers.rig import devices
     from cotarget.safety.signals import end_politely
     from cotarget.safety.stop_file import StopLook, refuse_if_stopped
@@ -367,20 +371,44 @@ def reset_head_command(options: argparse.Namespace) -> None:
     head = devices(config.hardware)["head"]
     if config.backend != "hardware" or missing_key(head.settings):
         raise ConfigError(f'{options.rig}: names no pan-tilt unit; backend = "hardware" and [hardware.head] port do')
-    if not hasattr(head.driver, "reset"):
-        raise ConfigError(f"{options.rig}: the driver of {head.where} has no reset; the unit needs none")
     refuse_if_stopped(config.safety.stop_file)
-    if not options.yes:
-        print("The head will turn through its whole range. Are camera and cables clear of it? [yes/no]", flush=True)
-        if _answer().strip().lower() != CONSENT:
-            raise ConfigError("not reset; it needs the answer yes, or --yes")
+    if not hasattr(head.driver, "reset"):
+        _trust_position(options, config, head)
+        return
+    _ask(options, "The head will turn through its whole range. Are camera and cables clear of it?")
     look, undo = StopLook(config.safety.stop_file), end_politely()
     try:
-        done = head.driver.reset(head.settings, MonotonicClock(), config.safety, look.reason)
+        with rig_lock(*(head.addresses if head.own else ()), file=options.rig):
+            done = head.driver.reset(head.settings, MonotonicClock(), config.safety, look.reason)
     finally:
         undo()
         look.close()
     print(f"reset: {done}")
+
+
+def _trust_position(options: argparse.Namespace, config: "RigConfig", head: "Device") -> None:
+    """Remove the position-lost marker of a unit without a reset after consent."""
+    from cotarget.drivers.interlock import PositionLostMarker
+    from cotarget.drivers.rig import port_of
+
+    lost = PositionLostMarker(port_of(head), config.safety.stop_file)
+    if not lost.files():
+        raise ConfigError(f"{options.rig}: the driver of {head.where} has no reset; the unit needs none")
+    _ask(options, "The unit has no reset; switch it off and on. Does it stand where it reports?")
+    lost.forget()
+    print("reset: the reported position counts as true again")
+
+
+def _ask(options: argparse.Namespace, question: str) -> None:
+    """Ask for consent, unless --yes gives it.
+
+    Raises:
+        ConfigError: the answer is not yes.
+    """
+    if not options.yes:
+        print(f"{question} [yes/no]", flush=True)
+        if _answer().strip().lower() != CONSENT:
+            raise ConfigError("not reset; it needs the answer yes, or --yes")
 
 
 def _answer() -> str:

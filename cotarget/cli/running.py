@@ -254,6 +254,9 @@ def _detect_in_folder(
         warn_unscored(file, beyond, scored, labelled, one["last_frame"], whole=whole)
 
 
+WORDS = {True: "ok     ", None: "unknown", False: "MISSING"}  # of the doctor's findings
+
+
 def doctor_command(options: argparse.Namespace) -> int:
     """Run `cotarget doctor`: check the installation and print fixes; return the exit status."""
     from cotarget.doctor import examine
@@ -265,7 +268,7 @@ def doctor_command(options: argparse.Namespace) -> int:
         config = load_config(options.rig)
     findings = examine(config) if options.rig is None else examine(config, options.rig)
     for finding in findings:
-        print(f"{'ok     ' if finding.ok else 'MISSING'}  {finding.name}: {finding.text}")
+        print(f"{WORDS[finding.ok]}  {finding.name}: {finding.text}")
         if finding.fix:
             print(f"         fix: {finding.fix}")
-    return 0 if all(finding.ok for finding in findings) else 1
+    return 1 if any(finding.ok is False for finding in findings) else 0

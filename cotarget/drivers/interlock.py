@@ -60,11 +60,11 @@ class PositionLostMarker:
         self.file = self._folder / f"{self._begin}{names[0]}{SUFFIX}"
         self._of_port = [without.with_name(f"{without.name}.{name}{SUFFIX}") for name in dict.fromkeys(names)]
 
-    def refuse(self) -> None:
-        """Raise if there is a marker for any unit of this rig, or for the unit at this port.
+    def files(self) -> list[Path]:
+        """List the markers for any unit of this rig, and for the unit at this port.
 
         Raises:
-            DeviceError: a marker exists; the message has its reason, and the remedy.
+            DeviceError: the folder of markers cannot be read.
         """
         try:
             files = sorted(self._folder.iterdir())
@@ -75,7 +75,15 @@ class PositionLostMarker:
                 f"{self._folder}: cannot be read, where it would say that the head's position is lost: {error.strerror}"
             ) from None
         found = [file for file in files if file.name.startswith(self._begin) and file.name.endswith(SUFFIX)]
-        for file in (*found, *(file for file in self._of_port if file.exists())):
+        return [*found, *(file for file in self._of_port if file.exists())]
+
+    def refuse(self) -> None:
+        """Raise if there is a marker for any unit of this rig, or for the unit at this port.
+
+        Raises:
+            DeviceError: a marker exists; the message has its reason, and the remedy.
+        """
+        for file in self.files():
             raise DeviceError(f"{_reason(file)} (or, where no unit is at that port any more, remove {file})")
 
     def note(self, reason: str) -> None:

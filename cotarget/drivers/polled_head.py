@@ -42,8 +42,12 @@ class AxisFacts:
         slowest: speed [steps/s].
         fastest: speed [steps/s].
         acceleration: [steps/s^2].
-        still_s: an axis stands when it has stayed at one step for this time [s]; longer than the slowest speed takes
-            for a step.
+        still_s: an axis stands when it has stayed at one step, or within its slack, for this time [s]; longer than the
+            slowest speed takes for a step.
+        slack: an axis that stands this far from its goal has arrived; 0 for a stepper, the control error of a servo
+            [steps].
+        loses_steps: whether the unit counts from a wrong position after the axis was blocked, as a stepper without an
+            encoder does. An axis that does not is asked where it is, and never has a lost position.
     """
 
     step: float
@@ -53,6 +57,8 @@ class AxisFacts:
     fastest: int
     acceleration: int
     still_s: float
+    slack: int = 0
+    loses_steps: bool = True
 
     def degrees(self, sign: int) -> tuple[float, float]:
         """Convert the limits to degrees with rig.toml's sign of the axis: lowest, highest."""
@@ -134,13 +140,16 @@ class HeadLink(Protocol):
         """Release the port; never raises."""
 
 
+StepSize = Positive | Annotated[tuple[Positive, Positive], "[pan, tilt]"]
+
+
 @model
 class PolledHeadSettings:
     """The settings in [hardware.head] that every polled head has.
 
     Attributes:
         port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
-        step_deg: step size that the unit is expected to report [degrees].
+        step_deg: step size that the unit is expected to report, or those of pan and tilt [degrees].
         pan_deg: range of pan that the unit is expected to report, with positive pan to the right [degrees].
         tilt_deg: range of tilt that the unit is expected to report, with positive tilt up [degrees].
         pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left.
@@ -151,7 +160,7 @@ class PolledHeadSettings:
 
     _: KW_ONLY
     port: Annotated[str, Needed("/dev/ttyUSB0")] = ""
-    step_deg: Positive
+    step_deg: StepSize
     pan_deg: Limits
     tilt_deg: Limits
     pan_sign: Annotated[int, OneOf(-1, 1)] = 1
@@ -160,9 +169,14 @@ class PolledHeadSettings:
     command_delay_s: NotNegative = 0.04
 
     @property
+    def steps_deg(self) -> tuple[float, float]:
+        """Step sizes of pan and tilt [degrees]."""
+        return self.step_deg if isinstance(self.step_deg, tuple) else (self.step_deg, self.step_deg)
+
+    @property
     def spec(self) -> HeadSpec:
-        """Describe the head; its acceleration is not known before it is opened."""
-        speed, step = math.radians(self.speed_deg_s), math.radians(self.step_deg)
+        """Describe the head by its coarser step; its acceleration is not known before it is opened."""
+        speed, step = math.radians(self.speed_deg_s), math.radians(max(self.steps_deg))
         limits = PanTiltLimits(_radians(self.pan_deg), _radians(self.tilt_deg), speed, math.inf, step)
         return HeadSpec(limits, self.command_delay_s)
 
@@ -188,6 +202,7 @@ class AxisTrack:
         self.polls: deque[tuple[float, int]] = deque(maxlen=2)
         self._valid = -float("inf")
         self._since: float | None = None
+        self._rest = 0  # position at that time [steps]
 
     @property
     def position(self) -> int:
@@ -198,8 +213,8 @@ class AxisTrack:
         """Add a poll: the position [steps] at ``t`` [s]."""
         if t < self._valid:
             self._since = None
-        elif self._since is None or position != self.position:
-            self._since = t
+        elif self._since is None or abs(position - self._rest) > self.facts.slack:
+            self._since, self._rest = t, position
         self.polls.append((t, position))
 
     def expect_motion(self, t: float) -> None:
@@ -207,7 +222,7 @@ class AxisTrack:
         self._valid, self._since = t, None
 
     def stands(self) -> bool:
-        """Return whether the axis has stayed at one step for as long as its facts ask for."""
+        """Return whether the axis has stayed in place for as long as its facts ask for."""
         return self._since is not None and self.polls[-1][0] - self._since >= self.facts.still_s
 
     def at(self, t: float) -> float:
@@ -412,7 +427,7 @@ class Loop:
                 self.snapshot = self._make_snapshot()
                 move.finish()
             elif self._late(move, move.deadline):
-                raise self._stalled(move)
+                self._refuse_stalled(move)
         self.snapshot = self._make_snapshot()
 
     def _poll_position(self) -> None:
@@ -444,22 +459,27 @@ class Loop:
         move.deadline = None
         self.moves.appendleft(move)  # a newer move in the queue replaces it, a halt drops it
 
-    def _off_goal(self, move: Move) -> bool:
-        """Return whether the newest poll of an axis is off the move's goal."""
-        return any(track.position != goal for track, goal in zip(self._tracks, move.goals, strict=True))
+    def _off_goal(self, move: Move) -> list[AxisTrack]:
+        """List the axes whose newest poll is farther off the move's goal than their slack."""
+        goals = zip(self._tracks, move.goals, strict=True)
+        return [track for track, goal in goals if abs(track.position - goal) > track.facts.slack]
 
     def _late(self, move: Move, deadline: float) -> bool:
         """Return whether a poll after the deadline shows an axis off its goal; a late thread alone does not count."""
-        return min(track.polls[-1][0] for track in self._tracks) > deadline and self._off_goal(move)
+        return min(track.polls[-1][0] for track in self._tracks) > deadline and bool(self._off_goal(move))
 
-    def _stalled(self, move: Move) -> PositionLostError:
+    def _refuse_stalled(self, move: Move) -> None:
+        """End a move that did not arrive in time; raise where an axis may have lost its position."""
         pan, tilt = (track.position for track in self._tracks)
         wanted = ", ".join(map(str, move.goals))
-        return PositionLostError(
-            self._link.name,
-            f"did not arrive in time: pan {pan}, tilt {tilt} steps, where {wanted} were commanded; it was halted, and "
-            "its position may be lost by something in its way or a weak motor supply",
-        )
+        what = f"did not arrive in time: pan {pan}, tilt {tilt} steps, where {wanted} were commanded; it was halted"
+        if any(track.facts.loses_steps for track in self._off_goal(move)):
+            raise PositionLostError(
+                self._link.name,
+                f"{what}, and its position may be lost by something in its way or a weak motor supply",
+            )
+        why = "see that nothing is in its way; if it always ends as far off, give its axes more slack in the driver"
+        self._give_up(move, DeviceError(f"the pan-tilt unit at {self._link.name} {what}; {why}"))
 
     def _stand(self) -> bool:
         return all(track.stands() for track in self._tracks)
@@ -683,13 +703,14 @@ def _checked(link: HeadLink) -> HeadLink:
 
 def compare(config: PolledHeadSettings, axes: tuple[AxisFacts, AxisFacts]) -> None:
     """Refuse a unit whose steps or limits differ from rig.toml; the message has both, and what to write."""
-    for word, axis in zip(("pan", "tilt"), axes, strict=True):
-        own = math.degrees(axis.step)
-        if abs(own - config.step_deg) > STEP_SHARE * config.step_deg:
-            raise ConfigError(
-                f"hardware.head.step_deg: the {word} of the unit at {config.port} has steps of {own:.6g} degrees, "
-                f"not {config.step_deg:.6g}; write step_deg = {own:.6g}, or change the unit's step mode"
-            )
+    steps = [math.degrees(axis.step) for axis in axes]
+    if any(abs(step - said) > STEP_SHARE * said for step, said in zip(steps, config.steps_deg, strict=True)):
+        own, said = (tuple(float(f"{step:.6g}") for step in each) for each in (steps, config.steps_deg))
+        raise ConfigError(
+            f"hardware.head.step_deg: pan and tilt of the unit at {config.port} have steps of {own[0]:.6g} and "
+            f"{own[1]:.6g} degrees, not {said[0]:.6g} and {said[1]:.6g}; write step_deg = "
+            f"{own[0] if own[0] == own[1] else list(own)}, or change the unit's step mode"
+        )
     for word, axis, expected, sign in (
         ("pan", axes[0], config.pan_deg, config.pan_sign),
         ("tilt", axes[1], config.tilt_deg, config.tilt_sign),
@@ -709,14 +730,14 @@ def _agree(found: tuple[float, float], expected: tuple[float, float]) -> bool:
 
 
 def _limits(axes: tuple[AxisFacts, AxisFacts], config: PolledHeadSettings) -> PanTiltLimits:
-    """Convert the unit's limits to radians with the signs of rig.toml."""
-    (pan, tilt), step = axes, axes[0].step
+    """Convert the unit's limits to radians with the signs of rig.toml; the step is the coarser one."""
+    pan, tilt = axes
     return PanTiltLimits(
         pan=_radians(pan.degrees(config.pan_sign)),
         tilt=_radians(tilt.degrees(config.tilt_sign)),
-        speed=min(math.radians(config.speed_deg_s), pan.fastest * step, tilt.fastest * step),
-        acceleration=min(pan.acceleration, tilt.acceleration) * step,
-        step=step,
+        speed=min(math.radians(config.speed_deg_s), *(axis.fastest * axis.step for axis in axes)),
+        acceleration=min(axis.acceleration * axis.step for axis in axes),
+        step=max(axis.step for axis in axes),
     )
 
 

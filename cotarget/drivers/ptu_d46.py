@@ -21,6 +21,7 @@ from cotarget.drivers.polled_head import (
     Poll,
     PolledHead,
     PolledHeadSettings,
+    StepSize,
     braking_s,
 )
 from cotarget.drivers.ptu_protocol import AXES, DELIMITER, HALT, PATIENCE_S, AxisName, Line, command, open_line
@@ -47,7 +48,7 @@ class D46Settings(PolledHeadSettings):
         pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as in the D46's manual.
     """
 
-    step_deg: Positive = 0.0514286
+    step_deg: StepSize = 0.0514286
     pan_deg: Limits = (-158.9, 158.9)
     tilt_deg: Limits = (-46.6, 31.1)
     pan_sign: Annotated[int, OneOf(-1, 1)] = -1

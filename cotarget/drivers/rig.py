@@ -144,8 +144,8 @@ class Device:
                 f'{self.where}.{key}: is missing; the hardware backend needs it, for example {key} = "{example}"'
             )
 
-    def probe(self) -> str:
-        """Describe the device in one line, by queries that change nothing.
+    def probe(self) -> str | None:
+        """Describe the device in one line, by queries that change nothing; None if its driver has no probe.
 
         Raises:
             ConfigError: the settings lack what is needed to find the device.
@@ -154,7 +154,7 @@ class Device:
         if missing_key(self.settings):
             raise ConfigError("is not configured")
         if not hasattr(self.driver, "probe"):
-            return "is not asked: its driver has no probe"
+            return None
         lock = rig_lock(*self.addresses) if self.own and self.role == "head" else contextlib.nullcontext()
         with lock, calling(self.where):
             return str(self.driver.probe(self.settings))

@@ -12,6 +12,7 @@ import pytest
 from cotarget.backends import OPENERS
 from cotarget.config import RigConfig
 from cotarget.drivers import ptu_d46
+from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.emulators.emulation import copied_tables
 from cotarget.errors import EmergencyStopError
 from cotarget.latency import Delay, HeadLatency
@@ -49,6 +50,39 @@ def test_stop_lasts_until_clear_with_the_same_stop_file(folder, capsys):
     refuse_if_stopped(path)
     call(capsys, "stop", "--rig", "stops.toml")
     assert call(capsys, "clear", "--rig", "stops.toml")[1] == "cleared: stopped by the operator\n"
+
+
+OWN_HEAD = """
+from cotarget.drivers.polled_head import PolledHead, PolledHeadSettings
+from cotarget.schema import Limits, model
+
+@model
+class Settings(PolledHeadSettings):
+    step_deg: float = 0.1
+    pan_deg: Limits = (-90.0, 90.0)
+    tilt_deg: Limits = (-30.0, 30.0)
+    speed_deg_s: float = 40.0
+
+class Head(PolledHead):
+    Settings = Settings
+"""
+
+
+def test_a_unit_without_a_reset_is_trusted_after_consent(folder, capsys, monkeypatch):
+    """What the marker advises works."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(folder))
+    (folder / "own.py").write_text(OWN_HEAD)
+    (folder / "own.toml").write_text(
+        f'backend = "hardware"\n[hardware.head]\ndriver = "own:Head"\nport = "/dev/nobody"\n{STOP_FILE}'
+    )
+    assert "needs none" in refused(capsys, "reset-head", "--rig", "own.toml", "--yes")
+    lost = PositionLostMarker("/dev/nobody", folder / "run" / "stop")
+    lost.note("it was blocked")
+    monkeypatch.setattr(sys, "stdin", io.StringIO("no\nyes\n"))
+    assert call(capsys, "reset-head", "--rig", "own.toml")[0] == 1
+    assert lost.files()
+    assert call(capsys, "reset-head", "--rig", "own.toml")[0] == 0
+    assert not lost.files()
 
 
 FOLLOW = ("follow", "--calibration", "good.json", "--target", "book", "--rig", "hw.toml")

@@ -241,6 +241,26 @@ def test_point_keeps_the_soft_limits(pointed, capsys, folder):
     assert json.loads(out)["pan_deg"] == pytest.approx(90, abs=math.degrees(pointed.head.limits.step))
 
 
+@pytest.mark.parametrize(("wanted", "moved"), [
+    ([], None),  # as for its pictures alone
+    (["--focal-mm", "9"], None),
+    (["--tilt-deg", "5"], None),  # pan would be clipped to the limits
+    (["--pan-deg", "10"], [10, 0]),
+])  # fmt: skip
+def test_point_moves_no_axis_that_is_not_asked_for(pointed, capsys, folder, wanted, moved):
+    """The head stands at 100 degrees, as before the limits were narrowed."""
+    pointed.head.move(math.radians(100), 0.0, wait=True)
+    pointed.head.log.clear()
+    (folder / "rig.toml").write_text("[safety]\npan_deg = [-45, 45]\n")
+    step = math.degrees(pointed.head.limits.step)
+    if wanted[:1] == ["--tilt-deg"]:
+        assert "cotarget point --pan-deg" in refused(capsys, "point", "--rig", "rig.toml", *wanted)
+    else:
+        said = json.loads(call(capsys, "point", "--rig", "rig.toml", *wanted)[1])
+        assert [said["pan_deg"], said["tilt_deg"]] == pytest.approx(moved or [100, 0], abs=step)
+    assert bool([what for what, _ in pointed.head.log if what == "move"]) == (moved is not None)
+
+
 def test_point_keeps_earlier_pictures(pointed, capsys, folder):
     point = ("point", "--rig", "rig.toml", "--pan-deg", "0", "--pictures", ".")
     status, out, err = call(capsys, *point)

@@ -249,6 +249,54 @@ def test_a_lost_position_is_remembered_until_the_unit_was_reset(opened, link, tm
     opened(safety).state()
 
 
+SERVO = replace(FACTS, slack=3, loses_steps=False)
+
+
+class ServoLink(CounterLink):
+    """A servo that ends off its goal by a few steps, and trembles by one."""
+
+    axes = (SERVO, SERVO)
+    off = 2
+
+    def poll(self):
+        polls = super().poll()
+        tremble = round(self.clock.now() / EXCHANGE_S) % 2
+        return [poll._replace(position=poll.position + self.off + tremble) for poll in polls]
+
+
+def test_a_servo_arrives_within_its_slack_and_never_loses_its_position(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    link, settings = ServoLink(SimClock()), PolledHeadSettings(**SETTINGS)
+    head = PolledHead(lambda: link, settings, link.clock)
+    for goal in (10 * STEP, 0.0):
+        head.move(goal, 0.0, wait=True)
+        assert not head.state().moving
+        assert head.state().pan == pytest.approx(goal + 2.5 * STEP, abs=0.6 * STEP)
+    link.stuck = True  # something is in its way
+    said = fails(lambda: head.move(500 * STEP, 0.0, wait=True))
+    assert "did not arrive in time" in said
+    assert "reset-head" not in said
+    link.stuck = False
+    head.move(500 * STEP, 0.0, wait=True)
+    link.off = 5
+    assert "more slack" in fails(lambda: head.move(0.0, 0.0, wait=True))
+    head.close()
+    link.off = 0
+    PolledHead(lambda: link, settings, link.clock).close()  # no marker keeps it from being opened again
+
+
+def test_axes_of_two_scales(opened, link):
+    """Advice that is followed is right."""
+    link.axes = (FACTS, replace(FACTS, step=STEP / 2, lowest=-1800, highest=1800, fastest=2000))
+    with pytest.raises(ConfigError, match=r"^hardware\.head\.step_deg: .* write step_deg = \[0\.1, 0\.05\]"):
+        opened()
+    link.sent.clear()
+    head = opened(step_deg=(0.1, 0.05))
+    assert (head.limits.step, head.limits.tilt) == (pytest.approx(STEP), pytest.approx((-math.pi / 2, math.pi / 2)))
+    head.move(10 * STEP, 10.5 * STEP, wait=True)
+    assert link.sent == [((10, -21), (400, 800))]
+
+
 # Halts
 
 

@@ -120,9 +120,17 @@ def test_velocity_mode_is_left_and_old_firmware_has_no_modes(bench):
         ({"PX": 2000}, {}, r"^hardware.head.pan_deg: .* write pan_deg = \[-158.9, 102.9\]$"),
         ({}, {"tilt_sign": -1}, r"^hardware.head.tilt_deg: .*\[-31.1, 46.6\], or tilt_sign = 1$"),
         ({"TN": -600, "TX": 907}, {}, r"^hardware.head.tilt_deg: .*\[-30.9, 46.6\], or tilt_sign = -1$"),
-        ({"PR": "92.5714"}, {}, r"^hardware.head.step_deg: the pan .* write step_deg = 0.0257143, or change"),
+        (
+            {"PR": "92.5714"},
+            {},
+            r"^hardware.head.step_deg: pan .* write step_deg = \[0.0257143, 0.0514286\], or change",
+        ),
         ({"TN": 0, "TX": 0}, {}, "cotarget reset-head"),
-        ({"TR": "46.2857"}, {}, r"^hardware.head.step_deg: the tilt .* write step_deg = 0.0128571, or change"),
+        (
+            {"TR": "46.2857"},
+            {},
+            r"^hardware.head.step_deg: pan .* write step_deg = \[0.0514286, 0.0128571\], or change",
+        ),
     ],
 )
 def test_another_unit_than_configured_is_refused_with_what_to_write(opened, facts, config, said):
