@@ -8,8 +8,8 @@ import pytest
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import parse_config
-from cotarget.errors import CalibrationError
+from cotarget.config import SafetyConfig, parse_config
+from cotarget.errors import CalibrationError, DeviceError
 from cotarget.latency import (
     command_delay,
     delay_between,
@@ -24,6 +24,8 @@ from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame, PanTiltState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.world import SimWorld
+from tests.support.rigs import guarded
+from tests.support.safety_rigs import SimulatedDevices
 
 # The figure asked for is 10 ms; the simulation is measured without a wire in between.
 CLOSE = 0.003  # [s]
@@ -132,6 +134,16 @@ def test_the_zoom_camera_against_the_head(world, late):
 
 
 @pytest.mark.render
+def test_a_head_beyond_its_limits_is_not_moved():
+    devices = SimulatedDevices()
+    devices.head.move(np.radians(100), 0.0, wait=True)
+    with guarded(devices, SafetyConfig(pan_deg=(-45.0, 45.0))) as rig:
+        devices.head.log.clear()
+        with pytest.raises(DeviceError, match="cotarget point --pan-deg"):
+            measure_head(rig)
+        assert devices.head.log == []
+
+
 def test_a_picture_that_stands_still_is_no_measurement(world):
     with pytest.raises(CalibrationError, match=r"pan 0\.0, tilt 0\.0 degrees"):
         measure_head(replace(world.rig, zoom=FrozenCamera(world.rig.zoom)), seconds=4.0)
