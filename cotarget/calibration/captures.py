@@ -180,12 +180,14 @@ def read_images(directory: Path, captures: Sequence[Capture]) -> Iterator[Captur
 
 
 def read_image(path: Path) -> Image:
-    """Read an image as BGR."""
+    """Read an image as BGR and as the sensor has it, like live ones; an EXIF orientation does not turn it."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    image = (
+        cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if data else None
+    )
     if image is None:
         raise CalibrationError(f"{path}: is not an image that OpenCV reads")
     return np.asarray(image, dtype=np.uint8)

@@ -67,7 +67,8 @@ def make_detector(target: TargetProfile, rate_hz: float) -> Detector:
         raise ConfigError('a target with detector = "colour" needs a template, a picture of the target')
     if not target.template.exists():
         raise ConfigError(f"{target.template}: no such file; a target's template is a PNG or JPEG of it")
-    template = cv2.imread(str(target.template), cv2.IMREAD_COLOR) if target.template.is_file() else None
+    how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # as live images are read
+    template = cv2.imread(str(target.template), how) if target.template.is_file() else None
     if template is None:
         raise ConfigError(f"{target.template}: is not a picture; a target's template is a PNG or JPEG of it")
     return ColorTemplateDetector(np.asarray(template, dtype=np.uint8))

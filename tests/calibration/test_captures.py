@@ -9,13 +9,17 @@ import pytest
 from cotarget.board import draw_board
 from cotarget.calibration import Options, calibrate_captures, calibrate_photos
 from cotarget.calibration.calibrate import find_views
-from cotarget.calibration.captures import INDEX, pair_photos, read_images, read_index
-from cotarget.config import BoardConfig
+from cotarget.calibration.captures import INDEX, pair_photos, read_image, read_images, read_index
+from cotarget.config import BoardConfig, TargetProfile
+from cotarget.detection import make_detector
+from cotarget.drivers.mjpeg import decode_jpeg
 from cotarget.errors import CalibrationError
+from tests.support.exif import COLOURED, tagged
 
 FIXED = {"file": "a.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 2.0}
 ZOOM = {"file": "b.png", "camera": "zoom", "board": 0, "pan": 0.1, "tilt": -0.2, "focal_px": 667.0, "t": 1.0}
 BOARD = {"kind": "chessboard", "corners": [9, 6], "square": 0.1}
+DECODERS_DIFFER = 5  # by two libraries, in the colour at an edge [grey levels]
 LARGE, SMALL = (48, 64), (24, 32)  # height and width [px]
 
 
@@ -70,6 +74,19 @@ def test_malformed_index_is_refused_with_its_key(folder, rows, changes, said):
     assert str(folder) in str(caught.value)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_exif_orientation_turns_no_picture(tmp_path, orientation, monkeypatch):
+    """A camera's photos, its stills over the wire and the template are all as its live frames are."""
+    path = tmp_path / "a.jpg"
+    path.write_bytes(tagged(orientation))
+    templates = []
+    monkeypatch.setattr("cotarget.detection.ColorTemplateDetector", templates.append)
+    make_detector(TargetProfile(0.2, "width", 160.0, "colour", template=path), 25.0)
+    for image in (read_image(path), decode_jpeg(path.read_bytes()), *templates):
+        assert image.shape == COLOURED.shape
+        assert np.abs(image.astype(int) - decode_jpeg(tagged(1))).max() < DECODERS_DIFFER
 
 
 def test_photos_leave_out_hidden_files(tmp_path):
