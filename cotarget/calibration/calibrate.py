@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from cotarget.board import board_points, check_board
-from cotarget.calibration.captures import CaptureIndex, pair_photos, read_images, read_index
+from cotarget.calibration.captures import NO_IMAGE, CaptureIndex, pair_photos, read_image, read_images, read_index
 from cotarget.calibration.corners import another_board, find_corners, guess_corners
 from cotarget.calibration.file import Calibration
 from cotarget.calibration.initialization import FEWEST_CORNERS, sequential
@@ -86,7 +86,7 @@ def find_views(
             if options.method == "sequential":
                 rejected.append(beyond_shortest(str(capture.source), capture.focal_px, shortest))
             else:
-                later.append(capture)
+                later.append(replace(capture, image=NO_IMAGE))  # read again when its turn comes, to save memory
             continue
         corners = find_corners(capture.image, index.board)
         if corners is None:
@@ -102,7 +102,7 @@ def find_views(
     if later:
         if progress is not None:
             progress(len(index.captures), len(index.captures), "fitting the shortest focal length")
-        more, lost = _find_parts(views, later, index.board, sizes, replace(options, folds=0))
+        more, lost = _find_parts(directory, views, later, index.board, sizes, replace(options, folds=0))
         views += more
         rejected += lost
     return views, rejected, sizes
@@ -133,6 +133,7 @@ def _another_kind(capture: Capture, board: BoardConfig) -> str:
 
 
 def _find_parts(
+    directory: Path,
     views: Sequence[View],
     captures: Sequence[Capture],
     board: BoardConfig,
@@ -143,19 +144,19 @@ def _find_parts(
     points = board_points(board)
     solution = joint(views, points, sizes, stops_of(views), options)
     model, known = solution.model, list(solution.views)
-    blank = [(capture.image, capture.view(unseen(len(points)))) for capture in captures]
-    rejected = [Rejected(view.name, NO_PLACE) for _, view in blank if view.board not in model.boards]
+    blank = [capture.view(unseen(len(points))) for capture in captures]
+    rejected = [Rejected(view.name, NO_PLACE) for view in blank if view.board not in model.boards]
     found: list[View] = []
-    for nominal in stops_of([view for _, view in blank]):
+    for nominal in stops_of(blank):
         model = model.with_zoom_head(lens=with_stop(model.head.lens, nominal))
         here: list[View] = []
-        waiting = [(image, view) for image, view in blank if same_focal(view, nominal) and view.board in model.boards]
+        waiting = [view for view in blank if same_focal(view, nominal) and view.board in model.boards]
         for learning in (True, False):  # images missed in the first round may be found once the sample is fitted
             missed = []
-            for image, view in waiting:
-                corners = find_expected(image, view, model, board)
+            for view in waiting:
+                corners = find_expected(read_image(directory / view.name), view, model, board)
                 if corners is None:
-                    missed.append((image, view))
+                    missed.append(view)
                     continue
                 here.append(replace(view, corners_px=corners))
                 if learning and len(here) <= LEARNING_VIEWS:
@@ -163,7 +164,7 @@ def _find_parts(
             if here:
                 model = _with_last_fitted(model, known, here, points)
             waiting = missed
-        rejected += [Rejected(view.name, NOT_EXPECTED) for _, view in waiting]
+        rejected += [Rejected(view.name, NOT_EXPECTED) for view in waiting]
         found += here
     return found, rejected
 

@@ -1,12 +1,14 @@
 """A session on a rig whose lens zooms, against its true optics over the range."""
 
+import weakref
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration import Options, predicted_pointing
-from cotarget.calibration.calibrate import calibrate
+from cotarget.calibration import Options, captures, predicted_pointing
+from cotarget.calibration.calibrate import calibrate, find_views
 from cotarget.calibration.joint import with_stop
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
@@ -19,6 +21,7 @@ from tests.support.synthetic_rig import FOURFOLD, SyntheticRig, fourfold, zoomed
 BOARD = BoardConfig()
 QUICK = Options(folds=0)
 STOPS = 4
+BEYOND = 6  # images beyond the shortest focal length, of a test that takes few
 # Every stop, and the middle between any two.
 FOCAL_LENGTHS = np.geomspace(NOMINAL_PX, FOURFOLD * NOMINAL_PX, 2 * STOPS - 1)
 TARGETS = 40
@@ -63,6 +66,31 @@ def test_session_finds_every_zoom_sample(session):
     assert calibration.residuals.rejected == ()
     in_part = [view for view in calibration.views if not view.seen.all()]
     assert in_part, "at four times the focal length a board fills more than the image"
+
+
+def test_saved_images_are_in_memory_one_at_a_time(session, monkeypatch):
+    """Of 8 MP stills each takes 24 MB."""
+    _, directory, _ = session
+    alive, most, decode = 0, 0, cv2.imdecode
+
+    def decoded(*args):
+        nonlocal alive, most
+        image, alive = decode(*args), alive + 1
+        most = max(most, alive)
+        weakref.finalize(image, gone)
+        return image
+
+    def gone():
+        nonlocal alive
+        alive -= 1
+
+    index = captures.read_index(directory)
+    beyond = [one for one in index.captures if one.focal_px is not None and one.focal_px > 1.1 * NOMINAL_PX]
+    few = [one for one in index.captures if (one not in beyond and one.board % 2 == 0) or one in beyond[:BEYOND]]
+    monkeypatch.setattr(cv2, "imdecode", decoded)
+    views, *_ = find_views(directory, replace(index, captures=tuple(few)), None, QUICK)
+    assert {view.source for view in views} >= {one.source for one in beyond[:BEYOND]}
+    assert 0 < most <= 2  # the last one is gone once the next is read
 
 
 @pytest.mark.parametrize("nominal", FOCAL_LENGTHS, ids=lambda n: f"{n:.0f}px")
