@@ -19,7 +19,7 @@ from cotarget.calibration.calibrate import determines_pose
 from cotarget.calibration.file import Calibration
 from cotarget.calibration.initialization import place_boards
 from cotarget.calibration.model import CAMERAS, CameraName, Covariance, View
-from cotarget.calibration.observability import name_directions, weak_directions
+from cotarget.calibration.observability import limits_of_use, name_directions
 from cotarget.calibration.planning import GRID
 from cotarget.calibration.uncertainty import STEP, miss_derivatives, model_of, predicted_pointing
 from cotarget.camera import ZoomLens
@@ -280,9 +280,13 @@ def left_open(calibration: Calibration) -> str:
     if covariance is None or not covariance.matrix.any():
         return ""
     focal = model_of(calibration).focal_px
-    matrix = covariance.matrix / (1.0 if held_out is None else held_out.widened**2)
-    normal = np.asarray(np.linalg.pinv(matrix, hermitian=True, rcond=np.finfo(float).tiny), dtype=float)
-    return name_directions(covariance.parameters, weak_directions(normal, covariance.parameters, 1.0, focal), focal)
+    limits = limits_of_use(covariance.parameters, focal)
+    widened = 1.0 if held_out is None else held_out.widened
+    # Divided by the limits, because eigenvalues of a matrix of mixed units are lost by rounding, as are those of its
+    # inverse.
+    values, vectors = np.linalg.eigh(covariance.matrix / np.outer(limits, limits))
+    weak = (vectors[:, values > widened**2] * limits[:, None]).T
+    return name_directions(covariance.parameters, weak, focal)
 
 
 # Evidence from the stored corners

@@ -24,6 +24,7 @@ from cotarget.report.analysis import (
     empty_places,
     gather,
     given,
+    left_open,
     lens_curves,
     pointing,
     what_stays,
@@ -204,6 +205,18 @@ def test_widening_does_not_make_parameters_undetermined(plain):
     words = advice(wrong, UNKNOWN)
     assert words[0].startswith("Captures kept out miss 3000 times")
     assert not any("Add what is missing" in item for item in words)
+
+
+def test_what_a_covariance_leaves_open_does_not_depend_on_units(plain):
+    """With a lens of 35 000 px, k2 is as well known with 6 million times the standard deviation, in its unit."""
+    lens, f = plain.zoom_head.lens, 50.0
+    longer = replace(lens, nominal_px=(f * lens.nominal_px[0],), stops=(lens.stops[0].scaled(f),))
+    powers = {"fx": 1, "fy": 1, "k1": 2, "k2": 4, "p1": 1, "p2": 1}
+    covariance = plain.covariance.scaled({f"zoom[0].{name}": f**power for name, power in powers.items()})
+    tele = with_zoom_head(bare(plain, covariance=covariance), lens=longer)
+    assert left_open(plain) == left_open(tele) == ""
+    unknown = replace(tele, covariance=covariance.scaled({"T_zoom0_fixed.tz": 1e6}))
+    assert left_open(unknown).startswith("T_zoom0_fixed's position is free")
 
 
 def test_corners_of_another_rig_are_noticed(plain):
