@@ -60,6 +60,7 @@ class Network:
             ConfigError: there is no such file, it cannot be run with that input, or its outputs have another layout.
         """
         self._config = config
+        self._output: str | None = None  # which of several outputs is read, once it is known
         self._file = OnnxFile(config.model, config.input_px)
         width, height = self._file.side.tolist()
         self._boxes(np.full((height, width, 3), PADDING, np.uint8))
@@ -127,20 +128,12 @@ class Network:
         blob = cv2.dnn.blobFromImage(picture, swapRB=True)
         mean, std = (np.array(each, np.float32).reshape(1, 3, 1, 1) for each in (config.mean, config.std))
         outputs = self._file.run((blob - mean) / std)
-        if not any(array.size for array in outputs.values()):
+        if self._output is not None:
+            outputs = {self._output: outputs[self._output]}
+        boxes = self._read(outputs) if any(array.size for array in outputs.values()) else None
+        if boxes is None:
             return np.zeros((0, 4)), np.zeros(0)
-        try:
-            corners, scores, labels = LAYOUTS[config.layout](outputs, self._file.side.astype(float))
-            if corners.shape != (len(scores), 4) or scores.ndim != 1 + (labels is None):
-                raise ValueError
-            if labels is None and not scores.shape[1]:  # no class
-                raise ValueError
-            if ((scores < -ROUNDING) | (scores > 1 + ROUNDING)).any():
-                raise ValueError
-        except (ValueError, IndexError, StopIteration):
-            shapes = ", ".join(f"{name} {array.shape}" for name, array in outputs.items())
-            wanted = f'layout "{config.layout}" has {WANTED[config.layout]}'
-            raise ConfigError(f"{config.model}: gives {shapes}; {wanted}") from None
+        corners, scores, labels = boxes
         if labels is not None:
             best = np.where(np.isin(labels, config.classes), scores, 0.0) if config.classes else scores
         elif max(config.classes, default=0) < scores.shape[1]:
@@ -150,6 +143,42 @@ class Network:
             raise ConfigError(f"{config.model}: {classes}; correct network.classes")
         good = (best >= config.least_score) & np.isfinite(corners).all(axis=1)
         return corners[good], best[good].clip(max=1.0)
+
+    def _read(self, outputs: Outputs) -> Boxes | None:
+        """Read boxes of all outputs, or of the one that fits the layout, such as beside raw heads.
+
+        Returns:
+            The boxes; None if an output without elements may be the one.
+
+        Raises:
+            ConfigError: no output fits, or several do.
+        """
+        config, side = self._config, self._file.side.astype(float)
+        if (boxes := _fitting(config.layout, outputs, side)) is not None:
+            return boxes
+        alone = {name: _fitting(config.layout, {name: array}, side) for name, array in outputs.items()}
+        fitting = [name for name, boxes in alone.items() if boxes is not None]
+        if len(fitting) == 1:
+            self._output = fitting[0]
+            return alone[self._output]
+        if not fitting and not all(array.size for array in outputs.values()):
+            return None
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in outputs.items())
+        text = f'{config.model}: gives {shapes}; layout "{config.layout}" has {WANTED[config.layout]}'
+        several = f"; {' and '.join(fitting)} fit it: keep one by onnx.utils.extract_model" if fitting else ""
+        raise ConfigError(text + several)
+
+
+def _fitting(layout: str, outputs: Outputs, side: Array) -> Boxes | None:
+    """Read outputs by a layout; None if they have another one."""
+    try:
+        boxes = LAYOUTS[layout](outputs, side)
+    except (ValueError, IndexError, StopIteration):
+        return None
+    scores, wanted = boxes.scores, 1 + (boxes.labels is None)
+    if boxes.corners.shape != (len(scores), 4) or scores.ndim != wanted or not all(scores.shape[1:]):  # no class
+        return None
+    return None if ((scores < -ROUNDING) | (scores > 1 + ROUNDING)).any() else boxes
 
 
 def _inside(whole: Array, tiled: Array) -> npt.NDArray[np.bool_]:
@@ -172,13 +201,13 @@ def _starts(length: int, side: int) -> list[int]:
 
 def _yolo(outputs: Outputs, side: Array) -> Boxes:
     """(1, 4 + classes, n): centre, size [px] and a score for each class; YOLOv8 and its successors."""
-    (table,) = (array[0].T for array in outputs.values())
+    table = _table(outputs).T
     return Boxes(_from_centers(table[:, :4]), table[:, 4:])
 
 
 def _yolov5(outputs: Outputs, side: Array) -> Boxes:
     """(1, n, 5 + classes): centre, size [px], objectness and a score for each class; YOLOv5 and YOLOv7."""
-    (table,) = (array[0] for array in outputs.values())
+    table = _table(outputs)
     if (table[:, 5:] > 1 + ROUNDING).any():
         raise ValueError
     return Boxes(_from_centers(table[:, :4]), table[:, 4:5] * table[:, 5:])
@@ -186,8 +215,8 @@ def _yolov5(outputs: Outputs, side: Array) -> Boxes:
 
 def _yolov10(outputs: Outputs, side: Array) -> Boxes:
     """(1, n, 6): corners [px], score and class; YOLOv10 and others that need no suppression."""
-    (table,) = (array[0] for array in outputs.values())
-    if table.shape[1] != 6:
+    table = _table(outputs)
+    if table.shape[1] != 6 or (np.abs(table[:, 5] - table[:, 5].round()) > ROUNDING).any():
         raise ValueError
     return Boxes(table[:, :4], table[:, 4], table[:, 5])
 
@@ -198,7 +227,10 @@ def _ssd(outputs: Outputs, side: Array) -> Boxes:
     Corners are normalised or in pixels.
     """
     if len(outputs) == 1:
-        (table,) = (array.reshape(-1, 7) for array in outputs.values())
+        (rows,) = outputs.values()
+        if rows.shape[-1] != 7:
+            raise ValueError
+        table = rows.reshape(-1, 7)
         labels, scores, corners = table[:, 1], table[:, 2], table[:, 3:]
     else:
         corners = _named(outputs, "box").reshape(-1, 4)
@@ -218,21 +250,21 @@ def _detr(outputs: Outputs, side: Array) -> Boxes:
 def _rtdetr(outputs: Outputs, side: Array) -> Boxes:
     """As DETR, with independent logits and none for no target; or (1, n, 4 + classes), boxes and scores."""
     if len(outputs) == 1:
-        (table,) = (array[0] for array in outputs.values())
+        table = _table(outputs)
         return Boxes(_from_centers(table[:, :4]) * np.tile(side, 2), table[:, 4:])
     logits = _named(outputs, "logit", "label", "class")[0]
     boxes = _from_centers(_named(outputs, "box", "det")[0])
     return Boxes(boxes * np.tile(side, 2), 1 / (1 + np.exp(-logits.clip(-50, 50))))
 
 
-# By layout, what the outputs are, for messages.
+# By layout, what the outputs are and what writes them, for messages.
 WANTED: Mapping[str, str] = {
-    "yolo": "(1, 4 + classes, n), with scores from 0 to 1",
-    "yolov5": "(1, n, 5 + classes), with scores from 0 to 1",
-    "yolov10": "(1, n, 6), with scores from 0 to 1",
-    "ssd": "outputs named boxes, labels and scores, or rows of 7 numbers",
-    "detr": "outputs named boxes and logits",
-    "rtdetr": "outputs named boxes and logits, or (1, n, 4 + classes)",
+    "yolo": "(1, 4 + classes, n), with scores from 0 to 1, as by yolo export with nms=False",
+    "yolov5": "(1, n, 5 + classes), with scores from 0 to 1, as by export.py, of YOLOv7 with --grid, without --train",
+    "yolov10": "(1, n, 6), with scores from 0 to 1, as by yolo export with nms=True",
+    "ssd": "outputs named boxes, labels and scores, as by output_names of torch.onnx.export, or rows of 7 numbers",
+    "detr": "outputs named boxes and logits, as by output_names of torch.onnx.export",
+    "rtdetr": "outputs named boxes and logits, as by output_names of torch.onnx.export, or (1, n, 4 + classes)",
 }
 # By layout, what makes boxes of the outputs and the input's size (width, height).
 LAYOUTS: Mapping[str, Callable[[Outputs, Array], Boxes]] = {
@@ -243,6 +275,14 @@ LAYOUTS: Mapping[str, Callable[[Outputs, Array], Boxes]] = {
     "detr": _detr,
     "rtdetr": _rtdetr,
 }
+
+
+def _table(outputs: Outputs) -> Array:
+    """Take the table of the only output, (1, rows, columns)."""
+    (array,) = outputs.values()
+    if array.ndim != 3 or len(array) != 1:
+        raise ValueError(array.shape)
+    return array[0]
 
 
 def _named(outputs: Outputs, *words: str) -> Array:

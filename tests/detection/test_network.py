@@ -10,6 +10,7 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS, NetworkConfig, parse_config
 from cotarget.detection import make_detector
+from cotarget.detection.network import Network
 from cotarget.doctor import examine
 from cotarget.errors import ConfigError
 from cotarget.rig import Frame
@@ -235,7 +236,8 @@ def test_a_file_that_opencv_cannot_run_is_run_by_onnxruntime(tmp_path, monkeypat
         detector(path)
 
 
-def test_a_network_that_finds_nothing_gives_no_rows(tmp_path):
+@pytest.mark.parametrize("raw", [{}, {"raw": [1, 1, 3, 6]}])
+def test_a_network_that_finds_nothing_gives_no_rows(tmp_path, raw):
     """As with suppression inside the file: the number of boxes is that of the targets."""
     g = Graph()
     left, top, right, bottom, score = edges(g, SIDE)
@@ -243,10 +245,60 @@ def test_a_network_that_finds_nothing_gives_no_rows(tmp_path):
     seen = g("Greater", g("Reshape", score, g.const([3], np.int64)), 0.5)
     rows = g("Reshape", g("NonZero", seen), g.const([-1], np.int64))
     g("Gather", table, rows, axis=1, name="output")
-    find = detector(g.save(tmp_path / "n.onnx", output=[1, "found", 6]), "yolov10")
+    if raw:
+        g("Reshape", table, g.const(raw["raw"], np.int64), name="raw")
+    find = detector(g.save(tmp_path / "n.onnx", **raw, output=[1, "found", 6]), "yolov10")
     assert find.detect(Frame(image(96, 64), 0.0)) == []
     assert boxes(find.detect(Frame(image(96, 64, red=(8, 4, 20, 8)), 0.0))) == [pytest.approx([8, 4, 20, 8])]
     assert find.detect(Frame(image(96, 64), 0.0)) == []
+
+
+def beside(path, runtime, first, **heads):
+    """Give a network further outputs of these shapes, which hold its own numbers; OpenCV cannot run some."""
+    model = onnx.load(path)
+    op = {"OpenCV": "Identity", "onnxruntime": "RandomUniformLike"}[runtime]
+    model.graph.node.append(onnx.helper.make_node(op, ["output"], ["copy"]))
+    for name, (shape, declared) in heads.items():
+        model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(shape), f"shape of {name}"))
+        model.graph.node.append(onnx.helper.make_node("Reshape", ["copy", f"shape of {name}"], [name]))
+        info = onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, declared)
+        model.graph.output.insert(0, info) if first else model.graph.output.append(info)
+    onnx.save(model, path)
+    return path
+
+
+@pytest.mark.parametrize("runtime", ["OpenCV", "onnxruntime"])
+@pytest.mark.parametrize("first", [False, True])
+@pytest.mark.parametrize(
+    ("layout", "shapes"),
+    [
+        ("yolo", [[1, 7, 3, 2], [1, 7, 6, 1], [1, 1, 7, 6]]),
+        ("yolov5", [[1, 3, 2, 1, 8], [2, 3, 8], [6, 8]]),
+        ("yolov10", [[1, 3, 6, 1], [1, 2, 9]]),
+        ("ssd rows", [[1, 3, 7, 1], [21]]),
+    ],
+)
+def test_the_output_of_the_layout_is_read_beside_raw_heads(tmp_path, layout, shapes, first, runtime):
+    if runtime == "onnxruntime":
+        pytest.importorskip(runtime)
+    heads = {f"{540 + i}": (shape, [None if i else n for n in shape]) for i, shape in enumerate(shapes)}
+    path = beside(network(tmp_path / "n.onnx", layout), runtime, first, **heads)
+    assert str(Network(NetworkConfig(path, layout.split()[0]))).endswith(f"run by {runtime}")
+    find = detector(path, layout)
+    for x in (8, 40):
+        assert boxes(find.detect(Frame(image(96, 64, red=(x, 4, 20, 8)), 0.0))) == [pytest.approx([x, 4, 20, 8])]
+    assert find.detect(Frame(image(96, 64), 0.0)) == []
+
+
+def test_an_output_that_is_not_known_to_be_the_one_is_refused_with_the_way_out(tmp_path):
+    two = beside(network(tmp_path / "two.onnx", "yolo"), "OpenCV", False, copied=([1, 7, 6], [1, 7, 6]))
+    raw = beside(network(tmp_path / "raw.onnx", "ssd rows"), "OpenCV", False, raw=([1, 3, 7, 1], [1, 3, 7, 1]))
+    for path, layout, message in (
+        (two, "yolo", r"gives output \(1, 7, 6\), copied \(1, 7, 6\); .*; output and copied fit it: keep one by "),
+        (raw, "yolov5", r"gives output \(1, 1, 3, 7\), raw \(1, 3, 7, 1\); .* as by export.py, of YOLOv7 with --grid"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            detector(path, layout)
 
 
 def test_one_table_of_boxes_and_scores_is_an_rtdetr_too(tmp_path):
