@@ -409,6 +409,7 @@ class _Run:
         interval = min(self._frames.interval, LONGEST_INTERVAL_S)
         detections = self._detector.detect(frame)
         tracks = update_tracks(self._tracker, detections, frame.t, self._detector)
+        self._mask = self._detector.mask  # made anew at each access
         zoom, found = self._estimate(frame, tracks)
         followed = self._select(tracks)
         outcome = self._search(tracks) if followed is None else self._follow(followed, frame.t, interval)
@@ -423,7 +424,7 @@ class _Run:
             reason=_joined([*outcome.reasons, *warnings, *self._frames.faults()]),
             fixed=frame,
             zoom=zoom,
-            mask=self._detector.mask,
+            mask=self._mask,
             detections=tuple(detections),
             tracks=tuple(tracks),
             target=followed,
@@ -441,7 +442,7 @@ class _Run:
     def _estimate(self, frame: Frame, tracks: list[Track]) -> tuple[Frame, ZoomMeasurement | None]:
         """Update the 3D estimates with both cameras' newest frames; return the zoom frame and what it measured."""
         favoured = {track.id for track in tracks if self._selector.favours(track)}
-        self._fusion.update_fixed(frame, tracks, self._detector.mask, favoured)
+        self._fusion.update_fixed(frame, tracks, self._mask, favoured)
         self._read_states()
         zoom = self._frames.read_zoom()
         return zoom, self._fusion.update_zoom(zoom if self._frames.zoom_is_new else None, frame.t)
@@ -478,7 +479,7 @@ class _Run:
             return _Outcome(State.SEARCHING, (unmet,))
         if tracks:
             return _Outcome(State.SEARCHING, ("what is detected is not confirmed yet",))
-        part = flood(self._detector.mask)
+        part = flood(self._mask)
         why = part and f": {part:.0%} of the fixed image changed at once, as when the light does or the camera moves"
         return _Outcome(State.SEARCHING, (f"nothing is detected{why or ''}",))
 
