@@ -106,9 +106,34 @@ def depth_of(
     )
 
 
-# Sizes of targets [m]. Beyond them another unit was meant: a beetle has 5 mm, the largest aircraft 84 m.
-SIZES_M = (1e-3, 200.0)
+# Sizes of targets [m]. Beyond them another unit was meant: a beetle has 5 mm, the largest aircraft 84 m. A person's
+# height in centimetres is beyond them, and so is a ship, which insisting accepts.
+SIZES_M = (1e-3, 100.0)
 KIND_TIMES = 10.0  # factor beyond which a target of a known kind has a size that its kind never has
+
+
+def size_implausibility(target: TargetProfile, name: str = "") -> str:
+    """Describe why a target profile's size is far outside of anything plausible; empty where it is not.
+
+    Args:
+        target: the target profile.
+        name: name of the target in the rig's configuration; its kind, such as that of ``bird2``, has a usual size.
+    """
+    where = f"targets.{name}" if name else "target"
+    if not SIZES_M[0] <= target.size <= SIZES_M[1]:
+        return (
+            f"{where}.size: {target.size:g} m is no size of a target; sizes are in metres, and {target.size:g} cm are "
+            f"{target.size / 100:g}"
+        )
+    usual = DEFAULT_TARGETS.get(split_name(name)[0])
+    if usual is not None and usual.dimension == target.dimension:
+        times = target.size / usual.size
+        if max(times, 1 / times) > KIND_TIMES:
+            return (
+                f"{where}.size: {target.size:g} m is far from the {usual.size:g} m of a {split_name(name)[0]}; sizes "
+                "are in metres"
+            )
+    return ""
 
 
 def target_implausibility(target: TargetProfile, calibration: Calibration, spec: RigSpec, name: str = "") -> str:
@@ -123,17 +148,9 @@ def target_implausibility(target: TargetProfile, calibration: Calibration, spec:
     Raises:
         ConfigError: a stream has another aspect ratio than that calibrated.
     """
+    if text := size_implausibility(target, name):
+        return text
     where = f"targets.{name}" if name else "target"
-    if not SIZES_M[0] <= target.size <= SIZES_M[1]:
-        return f"{where}.size: {target.size:g} m is no size of a target; sizes are in metres"
-    usual = DEFAULT_TARGETS.get(split_name(name)[0])
-    if usual is not None and usual.dimension == target.dimension:
-        times = target.size / usual.size
-        if max(times, 1 / times) > KIND_TIMES:
-            return (
-                f"{where}.size: {target.size:g} m is far from the {usual.size:g} m of a {split_name(name)[0]}; sizes "
-                "are in metres"
-            )
     along = 1 if target.is_vertical() else 0
     room_px = max(spec.zoom.size) if target.largest_over_time else spec.zoom.size[along]
     if target.wanted_px > room_px:

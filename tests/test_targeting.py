@@ -309,6 +309,8 @@ BOOK, PERSON, BIRD = (DEFAULT_TARGETS[name] for name in ("book", "person", "bird
     (replace(BIRD, size=80.0), "bird2", spec(), "targets.bird2.size"),
     (replace(BOOK, size=23.4), "house", spec(), None),
     (replace(BOOK, size=600.0), "dog", spec(), "targets.dog.size"),
+    (replace(BOOK, size=84.0), "aircraft", spec(), None),
+    (replace(BOOK, size=175.0), "visitor", spec(), "targets.visitor.size"),
     (replace(BOOK, size=600.0), "", spec(), "target.size"),
     (replace(BOOK, wanted_px=5000.0), "book", spec(), "targets.book.wanted_px"),
     (PERSON, "person", spec((320, 240)), "targets.person.wanted_px"),

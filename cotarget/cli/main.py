@@ -212,9 +212,11 @@ def _add_following(command: Command) -> None:
     how_far.add_argument(
         "--size-px", type=positive, metavar="S", help="size of the target of --target in the fixed image [px]"
     )
-    aim.add_argument("--target", metavar="NAME", help="a target of rig.toml, for its size")
+    aim.add_argument("--target", metavar="NAME", help="a target of rig.toml, for its size and its wanted size")
     how_close = aim.add_mutually_exclusive_group()
-    how_close.add_argument("--wanted-px", type=positive, metavar="N", help="wanted size in the close-up [px]")
+    how_close.add_argument(
+        "--wanted-px", type=positive, metavar="N", help="wanted size in the close-up (the target's) [px]"
+    )
     how_close.add_argument("--focal-mm", type=positive, metavar="F", help="focal length to use [mm]")
     _add_file(aim, "--rig", "rig.toml, for limits and targets (the default rig)")
     aim.add_argument(

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from cotarget.targeting import Aim, WantedSize
 
 
+LEAST_SEEN_PX = 1.0  # size of a target in the fixed image that no detector finds; it was given in millimetres
 SMALL_PX = 10.0  # smaller sizes are printed with two digits, others as whole pixels
 
 
@@ -60,8 +61,8 @@ def aim_command(options: argparse.Namespace) -> None:
     limits = spec.head.limits
     reach = Reach(limits.pan, limits.tilt, (shortest, max(shortest, longest)), step=limits.step)
     wanted, nominal = None, None
-    if target is not None and options.wanted_px is not None:
-        wanted = WantedSize(target.size, options.wanted_px, target.is_vertical())
+    if target is not None and options.focal_mm is None:
+        wanted = WantedSize(target.size, options.wanted_px or target.wanted_px, target.is_vertical())
     if options.focal_mm is not None:
         bounds = reach.focal_px[0] * pitch_mm, reach.focal_px[1] * pitch_mm
         check_within("--focal-mm", options.focal_mm, bounds, "the lens's {} mm")
@@ -71,7 +72,9 @@ def aim_command(options: argparse.Namespace) -> None:
     # The error budget holds for the exact inverse; the shortcut's additional error is not modelled.
     budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
     is_calibrated = _check_focal_length(calibration, found, pitch_mm)
-    is_plausible = _check_depth(calibration, found, config.targets if target is None else {options.target: target})
+    is_plausible = _check_depth(
+        options, calibration, found, config.targets if target is None else {options.target: target}
+    )
     if wanted is not None and found.limited:
         _check_shown_size(calibration, found, wanted, options.target)
     print_json(
@@ -106,15 +109,31 @@ def _check_focal_length(calibration: "Calibration", found: "Aim", pitch_mm: floa
     return False
 
 
-def _check_depth(calibration: "Calibration", found: "Aim", targets: Mapping[str, "TargetProfile"]) -> bool:
-    """Whether one of the targets fits into the fixed view at an aim's depth; warn if none does."""
+def _check_depth(
+    options: argparse.Namespace, calibration: "Calibration", found: "Aim", targets: Mapping[str, "TargetProfile"]
+) -> bool:
+    """Whether one of the targets fits into the fixed view at an aim's depth, and is seen there; warn if none does.
+
+    Raises:
+        ConfigError: the depth of --depth is so large that the fixed camera shows none of the targets.
+    """
     (width, height), (fx, fy) = calibration.fixed.size, calibration.fixed.lens.focal_px
     nearest, name = min(
         (target.size * (fy / height if target.is_vertical() else fx / width), name) for name, target in targets.items()
     )
-    if found.depth >= nearest:
+    if found.depth < nearest:
+        _warn(
+            f"the {name} fits into the fixed view only from {nearest:.2g} m on: is a depth of {found.depth:g} m meant?"
+        )
+        return False
+    largest_px, name = max((fx * target.size / found.depth, name) for name, target in targets.items())
+    if largest_px >= LEAST_SEEN_PX:
         return True
-    _warn(f"the {name} fits into the fixed view only from {nearest:.2g} m on: is a depth of {found.depth:g} m meant?")
+    if options.depth is not None and not options.insist:
+        raise ConfigError(
+            f"--depth: at {options.depth:g} m the {name} is {largest_px:.2g} px large in the fixed image; is "
+            f"{options.depth / 1000:g} m meant? --insist aims there all the same"
+        )
     return False
 
 
@@ -128,6 +147,8 @@ def _check_shown_size(calibration: "Calibration", found: "Aim", wanted: "WantedS
 
 def _target(options: argparse.Namespace, config: "RigConfig", calibration: "Calibration") -> "TargetProfile | None":
     """Look up the target of --target, and check the options that need it."""
+    from cotarget.targeting import size_implausibility
+
     if options.target is None:
         if options.size_px is not None:
             raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
@@ -136,11 +157,13 @@ def _target(options: argparse.Namespace, config: "RigConfig", calibration: "Cali
         return None
     with naming("--target"):
         target = config.target(options.target)
-    size = calibration.zoom_head.lens.size
-    if options.wanted_px is not None and options.wanted_px > size[int(target.is_vertical())]:
-        raise ConfigError(
-            f"--wanted-px: {options.wanted_px:g} px do not fit into the zoom camera's {size[0]}x{size[1]} image"
-        )
+    if not options.insist and (text := size_implausibility(target, options.target)):
+        raise ConfigError(f"{options.rig}: {text}; --insist takes it all the same")
+    where, wanted_px, size = "--wanted-px", options.wanted_px, calibration.zoom_head.lens.size
+    if wanted_px is None and options.focal_mm is None and not options.insist:
+        where, wanted_px = f"--wanted-px: missing, and targets.{options.target}.wanted_px", target.wanted_px
+    if wanted_px is not None and wanted_px > size[int(target.is_vertical())]:
+        raise ConfigError(f"{where}: {wanted_px:g} px do not fit into the zoom camera's {size[0]}x{size[1]} image")
     return target
 
 

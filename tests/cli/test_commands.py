@@ -105,7 +105,7 @@ def test_aim_prints_json_with_the_documented_keys(folder, capsys):
     ("2.6", ["--target", "person"], None),
 ])  # fmt: skip
 def test_aim_warns_of_a_depth_at_which_no_target_fits(folder, capsys, depth, more, nearest):
-    found, warnings = aim_json(capsys, "--depth", depth, *more)
+    found, warnings = aim_json(capsys, "--depth", depth, "--focal-mm", "6", *more)
     assert found["depth_plausible"] is (nearest is None)
     assert len(warnings) == (nearest is not None)
     assert nearest is None or nearest in warnings[0]
@@ -123,11 +123,33 @@ def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, ca
     assert len(warnings) == 1
 
 
+@pytest.mark.parametrize(("more", "wanted_px"), [
+    (["--target", "book"], 160),
+    (["--target", "book", "--wanted-px", "100"], 100),
+    (["--target", "book", "--focal-mm", "20"], None),
+    ([], None),
+])  # fmt: skip
+def test_aim_shows_a_target_as_large_as_follow_does(folder, capsys, more, wanted_px):
+    """As large as its profile says, where neither --wanted-px nor --focal-mm says otherwise."""
+    found, _ = aim_json(capsys, "--depth", "12", *more)
+    shortest_or_given = (20.0 if "--focal-mm" in more else 6.0) * 692 / 6
+    expected = wanted_px * found["range_m"] / 0.234 if wanted_px else shortest_or_given
+    assert found["focal_px"] == pytest.approx(expected, rel=1e-4)  # principal point 7 px off
+
+
+@pytest.mark.parametrize(("depth", "plausible"), [("1200", True), ("1201", False)])
+def test_aim_at_a_depth_where_no_target_is_seen_has_to_be_insisted_on(folder, capsys, depth, plausible):
+    """A person of 1.75 m has 1 px at 1200.5 m, by a focal length of 686 px."""
+    assert aim_json(capsys, "--depth", depth, "--insist")[0]["depth_plausible"] is plausible
+    status, out, err = call(capsys, *AIM, "--depth", depth)
+    assert (status, bool(out), "is 1.201 m meant?" in err) == ((0, True, False) if plausible else (1, False, True))
+
+
 def test_aim_warns_of_a_size_that_the_lens_cannot_show(folder, capsys):
     """The size is along the known dimension, in whole pixels or two digits; one as wanted is not mentioned."""
 
     def aimed(depth, target):
-        found, warnings = aim_json(capsys, "--depth", depth, "--target", target, "--wanted-px", "160")
+        found, warnings = aim_json(capsys, "--depth", depth, "--target", target, "--wanted-px", "160", "--insist")
         return found, [line for line in warnings if f"the lens shows the {target}" in line]
 
     near, [line] = aimed("1", "person")
