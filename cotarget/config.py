@@ -148,8 +148,10 @@ class SimZoomCamera(SimCamera):
     12x consumer zoom, and no cubic fits them.
 
     Attributes:
-        focal_mm: shortest and longest nominal focal length [mm].
-        pitch_mm: nominal size of a pixel; focal_mm / pitch_mm is what the device reports [mm].
+        focal_px: true focal length; by default it grows with the image's width, and with focal_mm / pitch_mm [px].
+        focal_mm: shortest and longest nominal focal length; by default it grows with ``pitch_mm`` [mm].
+        pitch_mm: nominal size of a pixel; focal_mm / pitch_mm is what the device reports; by default it fits
+            ``focal_px`` [mm].
         lens_steps: number of lens positions, evenly spaced in the logarithm of the focal length.
         lens_speed: lens positions per second.
         focal_curve: relative change of the ratio of true to nominal focal length.
@@ -322,8 +324,21 @@ def _fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
         keys = given.get(name, {})
         # Nothing changes if size and focal length are the defaults.
         scaled = type(camera)().fitted(camera.size, camera.focal_px if "focal_px" in keys else None)
+        if isinstance(camera, SimZoomCamera):
+            scaled |= _fit_focal(camera, scaled, keys)
         cameras[name] = replace(camera, **{key: value for key, value in scaled.items() if key not in keys})
     return replace(sim, **cameras)  # type: ignore[arg-type]
+
+
+def _fit_focal(zoom: SimZoomCamera, scaled: Mapping[str, Any], given: Iterable[str]) -> dict[str, Any]:
+    """Fit what is not given of focal_px, focal_mm and pitch_mm, so that focal_px is near focal_mm / pitch_mm."""
+    larger = zoom.pitch_mm / scaled["pitch_mm"] if "pitch_mm" in given else 1.0
+    if "focal_mm" not in given:
+        return {"focal_mm": tuple(larger * focal for focal in zoom.focal_mm)}
+    longer = zoom.focal_mm[0] / SimZoomCamera.focal_mm[0]
+    if "focal_px" not in given:
+        return {"focal_px": tuple(longer / larger * focal for focal in scaled["focal_px"])}
+    return {"pitch_mm": longer * scaled["pitch_mm"]}
 
 
 def split_name(name: str) -> tuple[str, int]:

@@ -160,6 +160,35 @@ def test_reported_focal_length_scales_with_the_true_one(said):
         assert curve == pytest.approx([by * c for c in before])
 
 
+@pytest.mark.parametrize("said", [
+    {"focal_mm": [4.7, 94.0], "pitch_mm": 0.0048},  # 20x
+    {"focal_mm": [4.7, 94.0], "pitch_mm": 0.0048, "size": [1280, 720]},
+    {"focal_mm": [4.7, 94.0]},
+    {"focal_mm": [4.7, 94.0], "focal_px": [900, 901]},
+    {"pitch_mm": 0.0048},
+    {"pitch_mm": 0.0048, "focal_px": [900, 901]},
+])  # fmt: skip
+def test_of_true_and_nominal_focal_length_what_is_not_given_follows(said):
+    """Given values stay, and the true focal length is 692 px for each 6 mm over 0.009 mm."""
+    zoom = parse_config({"sim": {"zoom": said}}).sim.zoom
+    assert said == {key: value if key == "pitch_mm" else list(value) for key, value in
+                    ((key, getattr(zoom, key)) for key in said)}  # fmt: skip
+    assert zoom.focal_px[0] * zoom.pitch_mm / zoom.focal_mm[0] == pytest.approx(692 * 0.009 / 6)
+    assert zoom.focal_px[1] / zoom.focal_px[0] == pytest.approx(693 / 692, rel=1e-3)
+
+
+@pytest.mark.parametrize(("table", "named"), [
+    ({"zoom": {"focal_px": [692, 693], "focal_mm": [4.7, 94], "pitch_mm": 0.0048}},
+     "sim.zoom.focal_px: 692 px contradict the nominal 979.2 px, sim.zoom.focal_mm / pitch_mm; .* pitch_mm = 0.006792"),
+    ({"T_zoom0_fixed": {"translation": [-400, 30, 60], "rotvec_deg": [0, 0, 0]}},
+     "sim.T_zoom0_fixed.translation: 405.586 m is too large; is 0.405586 m meant?"),
+    ({"T_head_zoom": {"translation": [20, -80, 50], "rotvec_deg": [0, 0, 0]}}, "sim.T_head_zoom.translation: 96.4"),
+])  # fmt: skip
+def test_a_simulated_rig_that_contradicts_itself_or_is_in_millimetres_is_refused(table, named):
+    with pytest.raises(ConfigError, match=named):
+        check(parse_config({"sim": table}))
+
+
 def test_crop_keeps_the_offset_of_the_principal_point():
     fixed = parse_config({"sim": {"fixed": {"size": [320, 240], "focal_px": [686, 684]}}}).sim.fixed
     assert fixed.center_px == pytest.approx((159.5 + 325 - 319.5, 119.5 + 239 - 239.5))

@@ -15,6 +15,11 @@ from cotarget.sim.zoom_lens import optics_at
 CHECKED_FOCALS = 33
 # Largest movement of an entrance pupil, longer than any lens; beyond it millimetres were given [m].
 FARTHEST_PUPIL = 1.0
+# Largest distances between the cameras, and of the zoom camera from the head's axes [m]. In millimetres, those of usual
+# rigs are beyond them.
+LARGEST_M = {"T_zoom0_fixed": 100.0, "T_head_zoom": 10.0}
+# Largest ratio of the true to the nominal focal length, or the inverse: more than any lens's tolerance.
+FARTHEST_NOMINAL = 1.25
 MODEL_SUFFIXES = (".obj", ".stl", ".xml")  # files of a user's own target models
 
 
@@ -26,6 +31,7 @@ def check_sim(sim: SimConfig) -> None:
     """
     for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
         _check_camera(f"sim.{name}", camera)
+    _check_lengths(sim)
     if sim.effects.optics:
         _check_optics(sim.zoom)
     for name, waypoints in sim.paths.items():
@@ -33,6 +39,20 @@ def check_sim(sim: SimConfig) -> None:
             raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")
     _check_models(sim)
     _check_targets(sim)
+
+
+def _check_lengths(sim: SimConfig) -> None:
+    """Refuse poses in millimetres, and a true focal length that is not about the nominal one."""
+    for key, largest in LARGEST_M.items():
+        length = math.hypot(*getattr(sim, key).translation)
+        if length > largest:
+            raise ConfigError(f"sim.{key}.translation: {length:g} m is too large; is {length / 1000:g} m meant?")
+    true_px, nominal_px = sim.zoom.focal_px[0], sim.zoom.focal_mm[0] / sim.zoom.pitch_mm
+    if max(true_px / nominal_px, nominal_px / true_px) > FARTHEST_NOMINAL:
+        raise ConfigError(
+            f"sim.zoom.focal_px: {true_px:g} px contradict the nominal {nominal_px:.4g} px, sim.zoom.focal_mm / "
+            f"pitch_mm; leave one of the three keys out, or give pitch_mm = {sim.zoom.focal_mm[0] / true_px:.4g}"
+        )
 
 
 def _check_models(sim: SimConfig) -> None:
