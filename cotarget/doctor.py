@@ -11,7 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cotarget.errors import ConfigError, CotargetError, EmergencyStopError, MissingPackageError
+from cotarget.errors import (
+    ConfigError,
+    CotargetError,
+    EmergencyStopError,
+    MissingPackageError,
+    install_extra,
+    pip_install,
+)
 from cotarget.files import assets_dir
 
 if TYPE_CHECKING:
@@ -49,7 +56,7 @@ def examine(config: "RigConfig | None" = None, rig: Path = Path("rig.toml")) -> 
         _gphoto_cameras(needed=_is_real(config)),
     ]
     if config is not None:
-        found += [_emergency_stop(config, rig), *_own_detectors(config, rig)]
+        found += [_emergency_stop(config, rig), *_named(config, rig), *_own_detectors(config, rig)]
         if _is_real(config):
             found += [*_board(config, rig), *_devices(config, rig)]
     return found
@@ -75,12 +82,12 @@ def _package(name: str) -> Finding:
     try:
         return Finding(name, True, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
-        return Finding(name, False, "not installed", f"pip install {name}")
+        return Finding(name, False, "not installed", pip_install(name))
 
 
 def _assets() -> Finding:
     scenes = sorted(path.stem for path in (assets_dir() / "scenes").glob("*.xml"))
-    fix = "" if scenes else "pip install --force-reinstall cotarget"
+    fix = "" if scenes else "install cotarget again, from a whole clone or from its wheel"
     return Finding("sim_assets", bool(scenes), f"scenes {', '.join(scenes)}" if scenes else "not found", fix)
 
 
@@ -104,10 +111,10 @@ def _codec() -> Finding:
     try:
         import av
     except ImportError as error:
-        return Finding("H.264", False, f"PyAV cannot be imported: {error}", "pip install --force-reinstall av")
+        return Finding("H.264", False, f"PyAV cannot be imported: {error}", pip_install("--force-reinstall", "av"))
     if "libx264" in av.codecs_available:
         return Finding("H.264", True, "PyAV encodes it")
-    return Finding("H.264", False, "this PyAV cannot encode it", "pip install --force-reinstall av")
+    return Finding("H.264", False, "this PyAV cannot encode it", pip_install("--force-reinstall", "av"))
 
 
 def _serial_ports() -> Finding:
@@ -117,7 +124,7 @@ def _serial_ports() -> Finding:
         found = [f"{device} ({description})" for device, description in ports()]
     except ImportError as error:
         text = f"pyserial cannot be imported: {error}"
-        return Finding("serial ports", False, text, "pip install --force-reinstall pyserial")
+        return Finding("serial ports", False, text, pip_install("--force-reinstall", "pyserial"))
     return Finding("serial ports", True, ", ".join(found) or "none (none is needed for the simulation)")
 
 
@@ -128,7 +135,7 @@ def _gphoto_cameras(needed: bool) -> Finding:
     try:
         return Finding("gphoto2 cameras", True, (", ".join(cameras()) or "none on USB") + note)
     except CotargetError as error:
-        return Finding("gphoto2 cameras", not needed, f"{error}{note}", "pip install 'cotarget[hardware]'" * needed)
+        return Finding("gphoto2 cameras", not needed, f"{error}{note}", install_extra("hardware") * needed)
 
 
 def _emergency_stop(config: "RigConfig", rig: Path) -> Finding:
@@ -145,6 +152,20 @@ def _emergency_stop(config: "RigConfig", rig: Path) -> Finding:
     except ConfigError as error:
         return Finding(name, False, str(error), f"{'chmod u+w' if path.parent.is_dir() else 'mkdir -p'} {path.parent}")
     return Finding(name, True, "none")
+
+
+def _named(config: "RigConfig", rig: Path) -> list[Finding]:
+    """Find files that rig.toml names and that are missing, and targets of implausible sizes."""
+    from cotarget.recording.format import META
+    from cotarget.targeting import size_implausibility
+
+    files = {f"sim.models.{name}": path for name, path in config.sim.models.items()}
+    files |= {f"targets.{name}.template": target.template for name, target in config.targets.items() if target.template}
+    if config.recording is not None:
+        files["recording"] = config.recording / META
+    wrong = {where: f"{path}: no such file" for where, path in files.items() if not path.is_file()}
+    wrong |= {f"targets.{name}": size_implausibility(target, name) for name, target in config.targets.items()}
+    return [Finding(where, False, text, f"correct it in {rig}") for where, text in wrong.items() if text]
 
 
 def _own_detectors(config: "RigConfig", rig: Path) -> list[Finding]:
@@ -228,7 +249,7 @@ def _fix(error: CotargetError, name: str, there: str, rig: Path) -> str:
 
     match error:
         case MissingPackageError():
-            return "pip install 'cotarget[hardware]'"
+            return install_extra("hardware")
         case InUseError():
             return "end the program that has it" + (f", which 'fuser -v {there}' names" if "://" not in there else "")
         case NoPermissionError():

@@ -1,5 +1,7 @@
 """Define cotarget's exceptions; each message is one line that names what is wrong."""
 
+import shlex
+import sys
 from collections.abc import Iterable
 
 
@@ -42,3 +44,16 @@ class UnreachableError(CotargetError):
 def choices(names: Iterable[str]) -> str:
     """Format the valid choices for the end of an error message."""
     return ", ".join(sorted(names)) or "none"
+
+
+def pip_install(*arguments: str) -> str:
+    """Return the command that installs packages into the Python in use, which needs no active environment."""
+    return shlex.join([sys.executable, "-m", "pip", "install", *arguments])
+
+
+def install_extra(extra: str) -> str:
+    """Return the command that installs what an extra needs, from a clone as from a wheel: no index has cotarget."""
+    from importlib.metadata import requires
+
+    parts = (each.partition(";") for each in requires("cotarget") or [])
+    return pip_install(*(need.strip() for need, _, marker in parts if marker.strip() == f"extra == '{extra}'"))

@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from annotated_types import Ge
 
-from cotarget.errors import ConfigError, CotargetError
+from cotarget.errors import ConfigError, CotargetError, install_extra
 from cotarget.files import assets_dir, write_atomically
 from cotarget.parallel import end_with_parent, interrupts_kept_from_children
 
@@ -413,7 +413,9 @@ def on_dask(processes: int, scheduler: str | None) -> Iterator[Run]:
         import dask
         import distributed
     except ImportError as error:
-        raise ConfigError(f"{error.name} is not installed: pip install 'cotarget[experiments]'") from None
+        raise ConfigError(
+            f"{error.name} is not installed; the extra experiments has it: {install_extra('experiments')}"
+        ) from None
     logging.getLogger("distributed").setLevel(QUIET)
     with contextlib.ExitStack() as stack:
         if scheduler is None:

@@ -16,6 +16,7 @@ from cotarget.doctor import Finding, needed_packages
 from cotarget.drivers.ptu_d46 import UncalibratedError
 from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.plant import Feed
+from cotarget.errors import install_extra, pip_install
 
 
 @pytest.fixture
@@ -62,10 +63,10 @@ def test_a_missing_package_is_named_with_its_command(tried, monkeypatch, capsys)
         return "1.0"
 
     monkeypatch.setattr(doctor.importlib.metadata, "version", version)
-    assert finding("pyserial") == Finding("pyserial", False, "not installed", "pip install pyserial")
+    assert finding("pyserial") == Finding("pyserial", False, "not installed", pip_install("pyserial"))
     assert cli.main(["doctor"]) == 1
     out = capsys.readouterr().out
-    assert "MISSING  pyserial: not installed\n         fix: pip install pyserial\n" in out
+    assert f"MISSING  pyserial: not installed\n         fix: {pip_install('pyserial')}\n" in out
 
 
 @pytest.mark.parametrize("module", ["av", "serial.tools"])
@@ -75,11 +76,24 @@ def test_broken_package_does_not_stop_the_doctor(tried, monkeypatch, module):
         monkeypatch.delitem(sys.modules, "serial.tools.list_ports", raising=False)
     broken = [f for f in doctor.examine() if not f.ok]
     assert [f.name for f in broken] == ["H.264" if module == "av" else "serial ports"]
-    assert broken[0].fix.startswith("pip install")
+    assert broken[0].fix.startswith(f"{sys.executable} -m pip install")
 
 
 def findings(config):
     return {f.name: f for f in doctor.examine(config)}
+
+
+@pytest.mark.parametrize(("table", "name", "said"), [
+    ({"backend": "replay", "recording": "film"}, "recording", "film/recording.json: no such file"),
+    ({"targets": {"book": {"template": "cover.png"}}}, "targets.book.template", "cover.png: no such file"),
+    ({"sim": {"models": {"duck": "duck.obj"}}}, "sim.models.duck", "duck.obj: no such file"),
+    ({"targets": {"bird": {"size": 80}}}, "targets.bird", "targets.bird.size: 80 m is far from the 0.8 m"),
+])  # fmt: skip
+def test_what_a_rig_names_is_looked_for(tried, table, name, said):
+    assert name not in findings(parse_config({}))
+    found = findings(parse_config(table))[name]
+    assert (found.ok, found.fix) == (False, "correct it in rig.toml")
+    assert said in found.text
 
 
 def test_only_a_real_rig_needs_gphoto2(tried, monkeypatch):
@@ -87,8 +101,8 @@ def test_only_a_real_rig_needs_gphoto2(tried, monkeypatch):
     assert finding("gphoto2 cameras").ok
     found = findings(real(zoom={"port": "usb:"}))
     missing = found["gphoto2 cameras"]
-    assert (missing.ok, missing.fix) == (False, "pip install 'cotarget[hardware]'")
-    assert found["hardware.zoom"].fix == "pip install 'cotarget[hardware]'"
+    assert (missing.ok, missing.fix) == (False, install_extra("hardware"))
+    assert found["hardware.zoom"].fix == install_extra("hardware")
 
 
 def test_zoom_camera_and_board_presenter_are_probed(tried):

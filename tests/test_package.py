@@ -1,13 +1,33 @@
 """What the project says of itself is the same everywhere."""
 
 import re
+import shlex
+import sys
 import tomllib
 from pathlib import Path
 
+import pytest
+
 import cotarget
+from cotarget.errors import install_extra
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+@pytest.mark.parametrize("extra", ["hardware", "onnx", "experiments"])
+def test_an_extra_is_installed_by_what_it_needs(extra):
+    """No index has cotarget, and `pip` alone may be another Python's."""
+    words = shlex.split(install_extra(extra))
+    assert words[:4] == [sys.executable, "-m", "pip", "install"]
+    assert sorted(words[4:]) == sorted(PROJECT["optional-dependencies"][extra]) != []
+
+
+def test_nothing_advises_to_install_cotarget_from_an_index():
+    files = [path for folder in ("cotarget", "experiments", "docs") for path in (ROOT / folder).rglob("*.[pm][yd]")]
+    assert len(files) > 100
+    advice = re.compile(r"pip install [^`&\n]*\bcotarget\b")
+    assert [path for path in (*files, ROOT / "README.md") if advice.search(path.read_text(encoding="utf-8"))] == []
 
 
 def test_version_licence_and_authors_are_the_same_everywhere():

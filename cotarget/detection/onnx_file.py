@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from cotarget.errors import ConfigError
+from cotarget.errors import ConfigError, install_extra
 from cotarget.geometry import Array
 
 FLOAT32 = 1  # in onnx.proto
@@ -54,7 +54,7 @@ class OnnxFile:
                 run = load(path, declared.name)
                 run(grey)
             except ImportError:
-                reasons.append("onnxruntime may: pip install 'cotarget[onnx]'")
+                reasons.append(f"onnxruntime, of the extra onnx, may: {install_extra('onnx')}")
             except Exception as error:  # the errors of both share no class
                 reasons.append(f"{runtime} cannot run it ({_one_line(error)})")
             else:

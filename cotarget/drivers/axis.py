@@ -20,7 +20,7 @@ from annotated_types import Gt, Interval
 
 from cotarget.drivers.frame_buffer import BufferedCamera, BusyError, FrameBuffer, StreamRefusedError
 from cotarget.drivers.mjpeg import MultipartReader, boundary_of, import_simplejpeg
-from cotarget.errors import ConfigError, DeviceError, MissingPackageError
+from cotarget.errors import ConfigError, DeviceError, MissingPackageError, install_extra
 from cotarget.rig import CameraSpec, Clock
 from cotarget.schema import Check, Needed, NotNegative, Positive, Size, model
 
@@ -364,7 +364,9 @@ def _import_httpx() -> ModuleType:
     try:
         import httpx
     except ImportError:
-        raise MissingPackageError("devices on HTTP need httpx: pip install 'cotarget[hardware]'") from None
+        raise MissingPackageError(
+            f"devices on HTTP need httpx, of the extra hardware: {install_extra('hardware')}"
+        ) from None
     return httpx
 
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cotarget.errors import ConfigError, DeviceError, MissingPackageError
+from cotarget.errors import ConfigError, DeviceError, MissingPackageError, install_extra
 
 # This program's identity for cameras that pair: constant, so that nothing is stored. "cotarget" twice, in hex.
 GUID = ":".join(f"{byte:02x}" for byte in b"cotarget" * 2)
@@ -168,7 +168,6 @@ IO_READ, IO_WRITE, USB_CLEAR_HALT, USB_FIND, USB_CLAIM, IO_LOCK = -34, -35, -51,
 CAMERA_BUSY = -110
 # After these errors the connection is unusable and must be made again.
 LOST = frozenset({IO, TIMEOUT, IO_READ, IO_WRITE, USB_CLEAR_HALT, USB_FIND, USB_CLAIM, IO_LOCK})
-MISSING = "gphoto2 is not installed; pip install 'cotarget[hardware]'"
 # gphoto2's model name for any network camera; it cannot detect those.
 NETWORK_MODEL = "PTP/IP Camera"
 # Remedies for errors that a user can correct; the codes of a network camera do not say what is wrong.
@@ -372,6 +371,8 @@ def _gphoto2() -> Any:
     try:
         gphoto2 = importlib.import_module("gphoto2")
     except ImportError as error:
-        raise MissingPackageError(MISSING) from error
+        raise MissingPackageError(
+            f"gphoto2 is not installed; the extra hardware has it: {install_extra('hardware')}"
+        ) from error
     keep_settings_in_memory()
     return gphoto2

@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import dataclass
 from types import ModuleType
 
-from cotarget.errors import MissingPackageError
+from cotarget.errors import MissingPackageError, install_extra
 from cotarget.rig import Image
 
 # Within compressed data 0xff is followed by a zero, a restart marker or another 0xff; any other byte makes a marker.
@@ -120,7 +120,9 @@ def import_simplejpeg() -> ModuleType:
     try:
         import simplejpeg
     except ImportError:
-        raise MissingPackageError("JPEG cameras need simplejpeg: pip install 'cotarget[hardware]'") from None
+        raise MissingPackageError(
+            f"JPEG cameras need simplejpeg, of the extra hardware: {install_extra('hardware')}"
+        ) from None
     return simplejpeg
 
 

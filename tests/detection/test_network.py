@@ -231,7 +231,7 @@ def test_a_file_that_opencv_cannot_run_is_run_by_onnxruntime(tmp_path, monkeypat
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(
-        ConfigError, match=r"OpenCV cannot run it \(.+\); onnxruntime may: pip install 'cotarget\[onnx\]'$"
+        ConfigError, match=r"OpenCV cannot run it \(.+\); onnxruntime, .+ -m pip install 'onnxruntime>=[\d.]+'$"
     ):
         detector(path)
 

@@ -334,7 +334,7 @@ def test_no_server_at_the_address(url, kind, said):
 
 def test_httpx_is_named_where_it_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "httpx", None)
-    with pytest.raises(MissingPackageError, match=r"cotarget\[hardware\]"):
+    with pytest.raises(MissingPackageError, match=r"extra hardware: .+ -m pip install .*'httpx>="):
         AxisCamera(AxisSettings(url="http://127.0.0.1"), MonotonicClock())
 
 

@@ -52,7 +52,7 @@ def test_other_ports_are_refused(port):
 def test_without_gphoto2_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gphoto2", None)
     for call in (cameras, lambda: probe("usb:"), GphotoLink("usb:", "").open):
-        with pytest.raises(MissingPackageError, match=r"cotarget\[hardware\]"):
+        with pytest.raises(MissingPackageError, match=r"extra hardware has it: .+ -m pip install 'gphoto2>="):
             call()
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cotarget.errors import DeviceError
+from cotarget.errors import DeviceError, pip_install
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.truth import Truth
 from cotarget.sim.viewer.scene import Snapshot, WorldCopy, line_geoms
@@ -26,7 +26,7 @@ try:
     from mujoco.studio.web import web_server
 except ImportError as error:
     raise DeviceError(
-        f"the installed MuJoCo {mujoco.__version__} has no web viewer ({error}); pip install -U mujoco"
+        f"the installed MuJoCo {mujoco.__version__} has no web viewer ({error}): {pip_install('-U', 'mujoco')}"
     ) from None
 
 
