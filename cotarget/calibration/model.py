@@ -198,10 +198,19 @@ class BundleModel:
         return 0 if self.zoom_head is None else len(self.zoom_head.lens.stops)
 
     @property
+    def lenses(self) -> dict[str, Intrinsics]:
+        """Every lens, by the prefix of its parameters' names ("fixed", "zoom[0]")."""
+        return {"fixed": self.fixed.lens} | {f"zoom[{i}]": stop for i, stop in enumerate(self.head.lens.stops)}
+
+    @property
     def focal_px(self) -> dict[str, float]:
-        """Focal length of every lens [px], by the prefix of its parameters' names ("fixed", "zoom[0]")."""
-        lenses = {f"zoom[{i}]": stop for i, stop in enumerate(self.head.lens.stops)}
-        return {name: lens.focal_px[0] for name, lens in {"fixed": self.fixed.lens, **lenses}.items()}
+        """Focal length of every lens [px], named as in `lenses`."""
+        return {name: lens.focal_px[0] for name, lens in self.lenses.items()}
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Image size (width, height) of every lens [px], named as in `lenses`."""
+        return {name: lens.size for name, lens in self.lenses.items()}
 
     def stop_of(self, view: View) -> int | None:
         """Find the zoom sample of a view; None for the fixed camera's."""

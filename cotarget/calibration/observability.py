@@ -6,6 +6,7 @@ parameter divided by its limit of use, that is an eigenvalue below 1 of the norm
 texts say what is undetermined and which motions or views to add. Sources: docs/design-notes.md.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -20,13 +21,13 @@ from cotarget.geometry import Array, RigidTransform
 # optimum.
 USELESS_ROTATION = np.radians(5.0)
 USELESS_POSITION = 0.5  # [m]
-# Limit of use of a lens parameter: it moves corners at the image's edge by 50 px, about as much as 5 degrees at a focal
-# length of 600 px.
-USELESS_PX = 50.0
-EDGE_PX = 360.0  # from the middle of a usual image to its edge
-USUAL_FOCAL_PX = 600.0
+# Limit of use of a lens parameter, in half diagonals of the image: it moves corners near the image's edge by 50 px of
+# 640 x 480, about as much as 5 degrees at a focal length of 600 px.
+USELESS_SHARE, EDGE_SHARE = 0.125, 0.9
+USUAL_SIZE, USUAL_FOCAL_PX = (640, 480), 600.0
 USELESS_SCALE = 0.1  # limit of use of an encoder's scale: 5 of 50 degrees
 NO_FOCAL_PX: Mapping[str, float] = MappingProxyType({})
+NO_SIZES: Mapping[str, tuple[int, int]] = MappingProxyType({})
 TILT_BOARDS = "tilt the boards against the camera by 20 to 40 degrees, in several directions"
 OUTWARD = "show boards out to the image's corners"
 BOTH = "show both cameras the same placements, near and far"
@@ -110,7 +111,11 @@ def judge_motions(normal: Array, noise: Array, motions: RigidTransform, turns_ba
 
 
 def weak_directions(
-    normal: Array, parameters: Sequence[str], variance: float, focal_px: Mapping[str, float] = NO_FOCAL_PX
+    normal: Array,
+    parameters: Sequence[str],
+    variance: float,
+    focal_px: Mapping[str, float] = NO_FOCAL_PX,
+    sizes: Mapping[str, tuple[int, int]] = NO_SIZES,
 ) -> Array:
     """Find the directions that a normal matrix leaves undetermined, measured by the parameters' limits of use.
 
@@ -119,6 +124,7 @@ def weak_directions(
         parameters: names of the n parameters, as in `Covariance`.
         variance: variance of one coordinate [px^2]; 0 to find what even exact corners leave undetermined.
         focal_px: focal length of each lens [px], by the prefix of its parameters' names; 600 px for those not given.
+        sizes: image size of each lens (width, height) [px], likewise; 640 x 480 for those not given.
 
     Returns:
         Directions (k, n) in the parameters' units, the least known first. Divided by the limits of use they are
@@ -127,19 +133,25 @@ def weak_directions(
     Raises:
         CalibrationError: a parameter's name is unknown.
     """
-    limits = limits_of_use(parameters, focal_px)
+    limits = limits_of_use(parameters, focal_px, sizes)
     values, vectors = np.linalg.eigh(normal * np.outer(limits, limits))
     weak = values < max(variance, ROUNDING * values[-1])
     return (vectors[:, weak] * limits[:, None]).T
 
 
-def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapping[str, float] = NO_FOCAL_PX) -> str:
+def name_directions(
+    parameters: Sequence[str],
+    directions: Array,
+    focal_px: Mapping[str, float] = NO_FOCAL_PX,
+    sizes: Mapping[str, tuple[int, int]] = NO_SIZES,
+) -> str:
     """Describe undetermined directions in words, with what to add.
 
     Args:
         parameters: names of the n parameters, as in `Covariance`.
         directions: independent directions in the parameters' units, (k, n), as `weak_directions` returns them.
         focal_px: focal length of each lens [px], as in `weak_directions`.
+        sizes: image size of each lens [px], as in `weak_directions`.
 
     Returns:
         One sentence without a full stop; empty where there are no directions.
@@ -150,7 +162,7 @@ def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapp
     if not len(directions):
         return ""
     # The projection depends only on the space that the directions span.
-    basis = np.linalg.qr((directions / limits_of_use(parameters, focal_px)).T)[0]
+    basis = np.linalg.qr((directions / limits_of_use(parameters, focal_px, sizes)).T)[0]
     part = np.sum(basis**2, axis=1)
     reason = ""
     what: list[str] = []
@@ -174,30 +186,35 @@ def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapp
     return f"{reason}{listed(what)} {'is' if len(what) == 1 else 'are'} free; {listed(add)}"
 
 
-def limits_of_use(parameters: Sequence[str], focal_px: Mapping[str, float] = NO_FOCAL_PX) -> Array:
+def limits_of_use(
+    parameters: Sequence[str],
+    focal_px: Mapping[str, float] = NO_FOCAL_PX,
+    sizes: Mapping[str, tuple[int, int]] = NO_SIZES,
+) -> Array:
     """Look up the limit of use of each parameter, in its unit, (n,); see `weak_directions`."""
     limits = []
     for name in parameters:
         owner, _, kind = name.rpartition(".")
         f = focal_px.get(owner, USUAL_FOCAL_PX)
-        r = EDGE_PX / f
+        half_px = math.hypot(*sizes.get(owner, USUAL_SIZE)) / 2
+        useless_px, r = USELESS_SHARE * half_px, EDGE_SHARE * half_px / f
         match kind:
             case "rx" | "ry" | "rz" | "squareness" | "pan_zero" | "tilt_zero":
                 limits.append(USELESS_ROTATION)
             case "tx" | "ty" | "tz" | "axis_offset" | "pupil" | "warp_x" | "warp_y":
                 limits.append(USELESS_POSITION)
             case "fx" | "fy":
-                limits.append(USELESS_PX / r)
+                limits.append(useless_px / r)
             case "cx" | "cy":
-                limits.append(USELESS_PX)
+                limits.append(useless_px)
             case "k1":
-                limits.append(USELESS_PX / (f * r**3))
+                limits.append(useless_px / (f * r**3))
             case "k2":
-                limits.append(USELESS_PX / (f * r**5))
+                limits.append(useless_px / (f * r**5))
             case "k3":
-                limits.append(USELESS_PX / (f * r**7))
+                limits.append(useless_px / (f * r**7))
             case "p1" | "p2":
-                limits.append(USELESS_PX / (3 * f * r**2))
+                limits.append(useless_px / (3 * f * r**2))
             case "pan_scale" | "tilt_scale":
                 limits.append(USELESS_SCALE)
             case _:

@@ -39,8 +39,9 @@ POSE_DECIMALS = 4
 SETTLE, SETTLE_LONG = 0.05, 0.5
 FRAME_TIMEOUT = 5.0  # several times the latency of a slow network camera [s]
 # A board that a person holds is settled when its corners move by less than HELD_PX between two images HELD_FOR seconds
-# apart, and by at least LEFT_PX since the request (mean over the corners).
-HELD_PX, HELD_FOR, LEFT_PX = 0.3, 0.4, 8.0
+# apart, and by at least LEFT_PX since the request (mean over the corners). Both lengths grow with images wider than
+# these, in which hands shake by more pixels.
+HELD_PX, HELD_FOR, LEFT_PX, HELD_WIDTH = 0.3, 0.4, 8.0, 640
 TRIES = 3  # of a turn or image: on a busy machine the watchdog may halt the head, and frames may be too old
 LENS_TOLERANCE = 0.03  # relative to the focal length; a step of a usual lens is 0.02
 # Finds a board's corners in an image, given the view to be filled, whose corners are still nan.
@@ -124,13 +125,13 @@ class CaptureRecorder:
 
     def _wait_until_held(self, before: Array | None) -> None:
         """Wait until the board has moved from where it was seen ``before`` and is still, at most `Board.patience`."""
-        clock = self.rig.clock
+        clock, times = self.rig.clock, max(self.rig.fixed.size[0] / HELD_WIDTH, 1.0)
         deadline = clock.now() + self.rig.board.patience
         last = None
         while clock.now() < deadline:
             corners = self._fixed_corners()
-            has_left = corners is not None and (before is None or _apart(corners, before) > LEFT_PX)
-            if has_left and last is not None and corners is not None and _apart(corners, last) < HELD_PX:
+            has_left = corners is not None and (before is None or _apart(corners, before) > LEFT_PX * times)
+            if has_left and last is not None and corners is not None and _apart(corners, last) < HELD_PX * times:
                 return
             last = corners
             clock.sleep_until(clock.now() + HELD_FOR)

@@ -86,8 +86,9 @@ def with_consider_covariance(
 # Measured and predicted agree when the mean squared, whitened miss is below 1 + this many standard deviations of it.
 # The misses of a fold share the error of its fit: a placement counts as half an independent miss of two coordinates.
 CHANCE_SIGMAS, SHARE = 2.0, 0.5
-# With a larger predicted miss [px] the remaining placements do not determine the rig, and the check means nothing.
-DETERMINED_PX = 50.0
+# With a larger predicted miss, in widths of the zoom image, the remaining placements do not determine the rig, and the
+# check means nothing.
+DETERMINED = 50.0 / 640.0
 FEWEST_VIEWS = 3  # views of a zoom sample that must remain for a fold's views at it to be predicted
 
 
@@ -125,7 +126,7 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
         left.append(fit(started.model, kept, points, ()).residuals)
     miss, covariances = np.concatenate(misses), np.concatenate(expected)
     predicted_px = float(np.sqrt(np.mean(np.trace(covariances, axis1=1, axis2=2))))
-    if predicted_px > DETERMINED_PX:
+    if predicted_px > DETERMINED * found.model.head.lens.size[0]:
         return None
     whitened = np.einsum("vi,vij,vj->v", miss, np.linalg.inv(covariances), miss) / 2
     ratio2 = float(np.mean(whitened))

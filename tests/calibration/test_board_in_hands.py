@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from cotarget.board import draw_board
 from cotarget.calibration.recorder import CaptureRecorder
 from cotarget.config import BoardConfig
@@ -50,6 +52,24 @@ def test_session_stops_waiting_for_a_board_after_its_patience():
     recorder, begun = started(rig), rig.t
     recorder.present(pose([0, 0, -3.0], [0, 0, 0]))
     assert 5.0 <= rig.t - begun < 7.0
+
+
+def test_shaking_hands_count_as_still_whatever_the_image_size():
+    """A board in an image of 2560 px that moves to and fro by 0.25 px of 640."""
+    rig = SyntheticRig()
+    rig.board = replace(rig.board, patience=20.0)
+    rig.fixed.size = (2560, 1920)
+    board = draw_board(rig.board_config, 160)
+
+    def read(newer_than, timeout):
+        rig.t = max(rig.t, newer_than) + PERIOD
+        rig.frames += 1
+        return Frame(np.roll(board, rig.frames % 2 + 60 * (len(rig.placed) - 1), axis=1), rig.t)
+
+    rig.fixed.read = read
+    recorder, begun = started(rig), rig.t
+    recorder.present(pose([0, 0, 2.0], [0, 0, 0]))
+    assert rig.t - begun < 2.0
 
 
 def test_a_charuco_board_seen_in_part_counts_as_still():

@@ -120,5 +120,11 @@ def test_undetermined_folds_give_no_held_out_check():
     start = model_of(calibrated(drawn(Truth(), 99, BOARDS)))
     once = fitted(start, drawn(Truth(), 0, boards=6, looks=1))
     assert cross_validate(once, POINTS, None, folds=5) is None
-    twice = fitted(start, drawn(Truth(), 0, boards=6, looks=2))
-    assert cross_validate(twice, POINTS, None, folds=5).predicted_px < 10.0
+    views = drawn(Truth(), 0, boards=6, looks=2)
+    predicted_px = cross_validate(fitted(start, views), POINTS, None, folds=5).predicted_px
+    assert predicted_px < 10.0
+    finer = 512  # times the pixels in the same image
+    size = (640 * finer, 480 * finer)
+    start = replace(start, fixed=start.fixed.resized(size), zoom_head=start.head.resized(size))
+    again = cross_validate(fitted(start, [view.scaled(finer) for view in views]), POINTS, None, folds=5)
+    assert again.predicted_px == pytest.approx(finer * predicted_px, rel=SAME_FIT)

@@ -96,6 +96,18 @@ def test_limits_of_use_scale_with_the_focal_length():
     assert "distortion" not in name_directions(LENS_NAMES, weak, focal_px)
 
 
+@pytest.mark.parametrize("width", [640, 1920, 3264])
+@pytest.mark.parametrize(("edge_px", "undetermined"), [(49.0, False), (51.0, True)])
+def test_limits_of_use_scale_with_the_image(width, edge_px, undetermined):
+    """Of a lens in 640 x 480 px, whose edge is 360 px from the middle, or the same lens with finer pixels."""
+    times = width / 640
+    focal, size = {"fixed": 600.0 * times}, {"fixed": (width, width * 3 // 4)}
+    for name, sigma in (("fixed.k1", edge_px / (600 * 0.6**3)), ("fixed.cx", edge_px * times)):
+        weak = weak_directions(np.array([[1 / sigma**2]]), [name], 1.0, focal, size)
+        assert bool(len(weak)) == undetermined
+    assert "distortion" in name_directions(["fixed.k1"], np.array([[1.0]]), focal, size)
+
+
 @pytest.mark.parametrize(("angles", "begins", "free"), [
     ([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.0)], "only pan moved",
      ("position along the pan axis", "rotation about the pan axis", *OF_HEAD, "add tilt")),
