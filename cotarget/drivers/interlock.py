@@ -53,7 +53,8 @@ class PositionLostMarker:
 
     def __init__(self, port: str, stop_file: Path | None) -> None:
         self._has_lasting_port = not port.startswith("/dev/pts/")  # another emulator gets a pseudo-terminal's name
-        names = [re.sub(r"[^A-Za-z0-9.]+", "-", each).strip("-")[-LONGEST_NAME:] for each in (port, *_identities(port))]
+        lasting = [each for each in _identities(port) if not each.startswith("/dev/pts/")]
+        names = [re.sub(r"[^A-Za-z0-9.]+", "-", each).strip("-")[-LONGEST_NAME:] for each in (port, *lasting)]
         without = _state_home() / WITHOUT_STOP_FILE
         beside = without if stop_file is None else stop_file.absolute()
         self._folder, self._begin = beside.parent, f"{beside.name}."
