@@ -42,6 +42,8 @@ from annotated_types import Ge
 from cotarget.errors import ConfigError, CotargetError, install_extra
 from cotarget.files import assets_dir, write_atomically
 from cotarget.parallel import end_with_parent, interrupts_kept_from_children
+from experiments.tables import Row as Row
+from experiments.tables import spread_columns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,7 +60,6 @@ ANSWER_S = 10.0  # timeout of the scheduler's answer [s]
 QUIET = logging.CRITICAL + 10  # Dask's log is silent, because each failure is reported in one line
 DIED = "its process died; is there memory enough?"
 
-Row = dict[str, Any]
 Count = Annotated[int, Ge(1)]
 
 
@@ -137,8 +138,6 @@ def experiment_of(module: ModuleType) -> Experiment:
     Raises:
         TypeError: SETTINGS are no settings, or there is no `one`.
     """
-    from experiments.tables import spread_columns
-
     found = vars(module)
     if not isinstance(found["SETTINGS"], Settings):
         raise TypeError(f"SETTINGS are of a subclass of Settings, not {found['SETTINGS']!r}")

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.engine import Row
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -17,6 +15,7 @@ SPREAD = ("median", "least", "largest")
 WHOLE = 1000.0  # numbers from this on are printed without decimals
 BESIDE = 0.12  # offset of the values to the right of the median
 Range = tuple[float, float]
+Row = dict[str, Any]  # a row of an experiment: numbers, texts and truth values by column
 
 
 # Numbers
