@@ -5,7 +5,9 @@ status.
 """
 
 import argparse
+import codecs
 import contextlib
+import io
 import logging
 import os
 import signal
@@ -13,7 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import IO, Any, NoReturn
 
 from cotarget.cli import calibrating, following, operating, running
 from cotarget.cli.common import board_corners, duration, length, number, port, positive, ratio, whole
@@ -37,6 +39,15 @@ class Parser(argparse.ArgumentParser):
         if self.make_epilog is not None:
             self.epilog = self.make_epilog()
         return super().format_help()
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Print a help text or an error, which argparse does too; exit with status 1 where stdout does not take it."""
+        file = file or sys.stderr
+        try:
+            print(message, end="", file=file, flush=True)
+        except OSError as error:
+            if file is sys.stdout:
+                self.exit(1, "" if isinstance(error, BrokenPipeError) else f"{self.prog}: {error.strerror or error}\n")
 
     def error(self, message: str) -> NoReturn:
         """Exit with one line on stderr, without the usage."""
@@ -68,8 +79,18 @@ ONE_THREAD = ("OMP_NUM_THREADS", "1")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit status."""
     os.environ.setdefault(*ONE_THREAD)
-    parser = make_parser()
-    options = parser.parse_args(arguments)
+    codecs.register_error(AS_GIVEN, _encode_as_given)
+    for descriptor, name in enumerate(("stdout", "stderr"), start=1):
+        _prepare(descriptor, name)
+    try:
+        return _run(make_parser().parse_args(arguments))
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            _drop_unwritten(stream)
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Run the command of parsed options, and print in one line how it ended."""
     # SIGTERM and SIGHUP raise SystemExit, so that the rig halts and files are completed, as on Ctrl-C.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # nohup ignores SIGHUP; keep that
@@ -100,6 +121,52 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if _notes(end):
             _print_end(options.command, "terminated", end)
         raise
+
+
+# Standard streams
+
+AS_GIVEN = "cotarget.as_given"  # name of `_encode_as_given` for codecs
+
+
+def _encode_as_given(error: UnicodeError) -> tuple[str | bytes, int]:
+    """Encode what the locale cannot: bytes of a name or an argument as they were given, others with a backslash."""
+    try:
+        return codecs.lookup_error("surrogateescape")(error)
+    except UnicodeError:
+        return codecs.lookup_error("backslashreplace")(error)
+
+
+class ClosedStdout(io.TextIOBase):
+    """Stdout that was closed: what is printed fails, as on a full disk."""
+
+    def write(self, text: str) -> int:
+        """Refuse a text."""
+        raise OSError("stdout is closed")
+
+
+def _prepare(descriptor: int, name: str) -> None:
+    """Let a standard stream write any name; replace a closed one, whose descriptor the next file would get."""
+    stream = getattr(sys, name)
+    if stream is not None:
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=AS_GIVEN)
+        return
+    nothing = os.open(os.devnull, os.O_RDWR)
+    if nothing != descriptor:
+        os.dup2(nothing, descriptor)
+        os.close(nothing)
+    setattr(sys, name, ClosedStdout() if name == "stdout" else os.fdopen(descriptor, "w", closefd=False))
+
+
+def _drop_unwritten(stream: IO[str]) -> None:
+    """Drop what a stream did not take, which would change the exit status when Python flushes it."""
+    try:
+        stream.flush()
+    except OSError:
+        with contextlib.suppress(OSError):
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nothing, stream.fileno())
+            os.close(nothing)
 
 
 class StderrHandler(logging.Handler):

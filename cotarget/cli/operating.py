@@ -367,7 +367,8 @@ def stop_command(options: argparse.Namespace) -> None:
     from cotarget.safety.stop_file import find_stop_file, write_stop_file
 
     path = find_stop_file(options.rig)
-    write_stop_file(path, options.reason)
+    # A reason that is no text must not keep the stop from being written.
+    write_stop_file(path, os.fsencode(options.reason).decode(errors="replace"))
     print(f"stopped: no head that watches {path} moves until cotarget clear")
 
 

@@ -197,6 +197,38 @@ def _read(terminal):
         return b""
 
 
+AIM = "aim --calibration good.json --pixel 320 240 --depth 9"
+ASCII = "LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0"
+
+
+@pytest.mark.parametrize(("before", "line", "status", "out", "err"), [
+    ("", f"{AIM} >&-", 1, "", "cotarget aim: stdout is closed\n"),
+    ("", f"{AIM} >/dev/full", 1, "", "cotarget aim: No space left on device\n"),
+    ("", f"{AIM} >&- 2>&-", 1, "", ""),
+    ("", f"{AIM.replace('9', '0.01')} 2>&-", 0, '"depth_plausible": false', ""),  # its warning is not printed
+    ("", "--help >&-", 1, "", "cotarget: stdout is closed\n"),
+    ("", "aim --help >/dev/full", 1, "", "cotarget aim: No space left on device\n"),
+    ("", "dance 2>/dev/full", 2, "", ""),
+    ("", "stop --rig stop.toml >&-", 1, "", "cotarget stop: stdout is closed\n"),
+    ("", "stop --rig stop.toml --reason V\udcf6gel", 0, "stopped: ", ""),  # no UTF-8
+    (ASCII, AIM.replace("good", "fr\xfch"), 1, "", "cotarget aim: fr\xfch.json: no such file\n"),
+    ("", AIM.replace("good", "fr\udcfch"), 1, "", "cotarget aim: fr\udcfch.json: no such file\n"),
+])  # fmt: skip
+def test_streams_that_are_closed_full_or_of_another_locale(folder, before, line, status, out, err):
+    """One line says so, the exit status is not Python's own, and a stop is written whatever stdout is."""
+    true_calibration(RigConfig()).save(folder / "good.json")
+    (folder / "stop.toml").write_text('[safety]\nstop_file = "stop"\n')
+    shell = os.fsencode(f"{before} {sys.executable} -m cotarget {line}")
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run(["sh", "-c", shell], capture_output=True, check=False, env=environment)
+    assert (done.returncode, os.fsdecode(done.stderr)) == (status, err)
+    assert out in os.fsdecode(done.stdout)
+    assert bool(done.stdout) == bool(out)
+    if out.startswith('"'):
+        assert json.loads(done.stdout)
+    assert (folder / "stop").exists() == line.startswith("stop")
+
+
 def test_json_has_no_negative_zeros(capsys):
     print_json({"a": -0.0, "b": [-0.0, {"c": np.float64(-0.0)}], "d": "-0.0"})
     assert json.dumps(json.loads(capsys.readouterr().out)) == '{"a": 0.0, "b": [0.0, {"c": 0.0}], "d": "-0.0"}'
