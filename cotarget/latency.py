@@ -42,6 +42,7 @@ FIRST, LAST = 0.08, 0.5
 # Largest relative difference between the image's growth and the lens's report; beyond it something else made it grow.
 AS_REPORTED = 0.25
 CORNERS, WEAKEST, APART_PX = 200, 0.01, 8
+LATE_PERIODS = 2.5  # longest time between two frames or two reports of the head, in their usual times; then one is late
 FEWEST_CORNERS = 12  # with fewer corners there is no scale
 
 
@@ -88,6 +89,8 @@ def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
         grown = log_scales([frame.image for frame in frames])
         reported = math.log(after / before)
         if not abs(grown[-1] - reported) <= AS_REPORTED * abs(reported):
+            if late := lateness([frame.t for frame in frames], rig.spec.zoom.rate_hz):
+                raise CalibrationError(late)
             seen = "shows too little" if math.isnan(grown[-1]) else f"grows {math.exp(grown[-1]):.2f} times"
             raise CalibrationError(
                 f"the zoom camera's picture {seen} where the lens reports {after / before:.2f} times; point it at "
@@ -98,6 +101,24 @@ def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
         before = after
     low, middle, high = np.percentile(delays, (25, 50, 75)).tolist()
     return LensLatency(middle, (high - low) / 2, count)
+
+
+def lateness(frames: Sequence[float], rate_hz: float, states: Sequence[float] = ()) -> str:
+    """Describe how late frames of the zoom camera or reports of the head came; empty where none did.
+
+    Args:
+        frames: times of the frames [s].
+        rate_hz: the camera's frames per second.
+        states: times of the head's reports [s].
+    """
+    late = []
+    for what, times in (("frames of the zoom camera", frames), ("reports of the head", np.unique(states))):
+        apart = np.diff(times)
+        usual = 1 / rate_hz if times is frames else max(1 / rate_hz, float(np.median(apart))) if len(apart) else 0.0
+        if len(apart) and apart.max() > LATE_PERIODS * usual:
+            late.append(f"{what} came {apart.max():.2f} s apart, and not {usual:.2f} s")
+    busy = "the machine or the line is too busy; measure again when nothing else runs"
+    return f"{' and '.join(late)}: {busy}" if late else ""
 
 
 def start_of_motion(times: Array, part: Array) -> float:
@@ -200,11 +221,13 @@ class HeadLatency:
         zoom: delay by which the zoom camera's frames are dated too late; to be added to its latency.
         command: time from a command to the start of motion [s].
         frames: number of frames of the zoom camera.
+        late: what came late, so that the result is doubtful, see `lateness`.
     """
 
     zoom: Delay
     command: float
     frames: int
+    late: str = ""
 
 
 def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
@@ -216,7 +239,8 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
         seconds: duration [s].
 
     Raises:
-        CalibrationError: the image does not move with the head: it has no structure, or something in it moves.
+        CalibrationError: the image does not move with the head: it has no structure, or something in it moves; or the
+            head does not accelerate as it should; or frames or reports came too late for either.
         DeviceError: the head stands beyond its limits.
         StaleFrameError: frames stopped coming.
     """
@@ -252,17 +276,24 @@ def _wiggle(rig: Rig, home: tuple[float, float], seconds: float) -> HeadLatency:
         for frame in _frames(rig, rig.zoom, t + next(pauses), frames[-1].t if frames else None, states):
             frames.append(frame)
     rig.head.move(pan, tilt, wait=True)
-    if len(frames) < FEWEST:
-        raise StaleFrameError(f"the zoom camera gave {len(frames)} frames in {seconds:g} s; {FEWEST} are needed")
     times, pans = np.array([(state.t, state.pan) for state in states]).T
+    late = lateness([frame.t for frame in frames], rig.spec.zoom.rate_hz, times)
+    if len(frames) < FEWEST:
+        few = f"the zoom camera gave {len(frames)} frames in {seconds:g} s; {FEWEST} are needed"
+        raise StaleFrameError("; ".join(filter(None, (few, late))))
     zoom = _zoom_delay(frames, times, pans)
     if zoom.agreement < AGREEMENT:
-        raise CalibrationError(
+        unmoved = (
             f"the zoom camera's picture at pan {np.degrees(pan):z.1f}, tilt {np.degrees(tilt):z.1f} degrees does not "
             f"move with the head (correlation {zoom.agreement:.2f}); point it at something with structure that stands "
             "still, not at the sky"
         )
-    return HeadLatency(zoom, command_delay(starts, states, rig.head.limits.acceleration), len(frames))
+        raise CalibrationError(late or unmoved)
+    try:
+        command = command_delay(starts, states, rig.head.limits.acceleration)
+    except CalibrationError as error:
+        raise CalibrationError(late or str(error)) from None
+    return HeadLatency(zoom, command, len(frames), late)
 
 
 def _zoom_delay(frames: Sequence[Frame], times: Array, pans: Array) -> Delay:

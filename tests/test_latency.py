@@ -1,5 +1,6 @@
 """Latencies: of records whose delay is known, and of the simulation, which delays by what its config says."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -14,6 +15,7 @@ from cotarget.latency import (
     command_delay,
     delay_between,
     horizontal_shifts,
+    lateness,
     log_scales,
     measure_fixed,
     measure_head,
@@ -111,6 +113,40 @@ class FrozenCamera(LateCamera):
         return Frame(self.image, super().read(newer_than, timeout).t)
 
 
+class StallingCamera(LateCamera):
+    """A camera of a busy machine, which comes to read a frame 0.3 s late now and then."""
+
+    def __init__(self, camera, clock):
+        super().__init__(camera, 0.0)
+        self.clock, self.calls = clock, 0
+
+    def read(self, newer_than=None, timeout=1.0):
+        self.calls += 1
+        if self.calls % 50 == 0:
+            self.clock.sleep_until(self.clock.now() + 0.3)
+        return super().read(newer_than, timeout)
+
+
+class WeakHead(LateCamera):
+    """A head that states a third of its acceleration."""
+
+    @property
+    def limits(self):
+        return replace(self._camera.limits, acceleration=self._camera.limits.acceleration / 3)
+
+
+@pytest.mark.parametrize(("times", "states", "named"), [
+    (np.arange(20) / 10, np.arange(200) / 100, ""),
+    (np.delete(np.arange(20) / 10, [5]), (), ""),  # one was not read in time
+    (np.delete(np.arange(20) / 10, [5, 6]), (), "^frames of the zoom camera came 0.30 s apart, and not 0.10 s"),
+    (np.arange(200) / 50, np.repeat(np.arange(8) / 2, 25), ""),  # a head that reports seldom, as over a network
+    (np.arange(20) / 10, np.delete(np.arange(200) / 100, np.s_[9:40]), "^reports of the head came 0.32 s apart, "),
+])  # fmt: skip
+def test_frames_and_reports_that_come_late(times, states, named):
+    late = lateness(times, 10.0, states)
+    assert re.search(named, late) if named else not late
+
+
 @pytest.fixture(scope="module")
 def world():
     world = SimWorld(parse_config({"sim": SMALL}))
@@ -147,6 +183,18 @@ def test_a_head_beyond_its_limits_is_not_moved():
 def test_a_picture_that_stands_still_is_no_measurement(world):
     with pytest.raises(CalibrationError, match=r"pan 0\.0, tilt 0\.0 degrees"):
         measure_head(replace(world.rig, zoom=FrozenCamera(world.rig.zoom)), seconds=4.0)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("broken", ["head", "zoom"])
+@pytest.mark.parametrize("busy", [False, True])
+def test_a_busy_machine_is_named_in_place_of_what_may_be_right(world, broken, busy):
+    zoom, head = world.rig.zoom, world.rig.head
+    zoom, head = (FrozenCamera(zoom), head) if broken == "zoom" else (zoom, WeakHead(head, 0.0))
+    rig = replace(world.rig, zoom=StallingCamera(zoom, world.rig.clock) if busy else zoom, head=head)
+    usual = "correct the head's limits" if broken == "head" else "point it at something with structure"
+    with pytest.raises(CalibrationError, match="reports of the head came 0.3.* too busy" if busy else usual):
+        measure_head(rig, seconds=4.0)
 
 
 @pytest.mark.render

@@ -298,17 +298,17 @@ def latency_command(options: argparse.Namespace) -> None:
             agreement["fixed"] = fixed.agreement
     if calibration is None:
         print("the fixed camera's latency needs --calibration, to look at a board with both cameras", file=sys.stderr)
-    rounded = {name: None if math.isnan(value) else _plausible(name, value) for name, value in found.items()}
+    rounded = {name: None if math.isnan(value) else _plausible(name, value, head.late) for name, value in found.items()}
+    if head.late:
+        print(f"cotarget latency: the values are doubtful: {head.late}", file=sys.stderr)
     print_json({"measured": rounded, "agreement": agreement})
 
 
-def _plausible(name: str, seconds: float) -> float:
+def _plausible(name: str, seconds: float, late: str) -> float:
     """Round a latency for rig.toml; refuse one that is negative beyond the measurement's accuracy."""
     if seconds < -ACCURACY_S:
-        raise CalibrationError(
-            f"{name}: {1000 * seconds:.0f} ms was measured, which is implausible: see that the picture has structure "
-            "and that nothing else moves in it, and measure again"
-        )
+        why = late or "see that the picture has structure and that nothing else moves in it, and measure again"
+        raise CalibrationError(f"{name}: {1000 * seconds:.0f} ms was measured, which is implausible: {why}")
     return max(round(seconds, DIGITS), 0.0)
 
 

@@ -155,10 +155,11 @@ def test_stop_and_help_import_nothing_heavy(folder, command):
 @pytest.mark.parametrize(("delay", "configured"), [(0.02, 0.08), (-0.06, 0.0), (-0.065, 0.0), (-0.2, None)])
 def test_latency_refuses_a_clearly_negative_delay(folder, capsys, monkeypatch, delay, configured):
     """The default simulation has 60 ms; a sum slightly below zero is zero."""
-    found = HeadLatency(Delay(delay, 0.99), command=0.04, frames=100)
+    found = HeadLatency(Delay(delay, 0.99), command=0.04, frames=100, late="too busy")
     monkeypatch.setattr("cotarget.latency.measure_head", lambda rig: found)
     monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(SimulatedDevices()))
     status, out, err = call(capsys, "latency", "--rig", "sim.toml")
+    assert "too busy" in err
     if configured is None:
         assert (status, out) == (1, "")
         assert err.splitlines()[-1].startswith("cotarget latency: sim.zoom.latency_s: -140 ms")
