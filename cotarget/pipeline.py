@@ -66,8 +66,8 @@ class FrameSource:
 
     Attributes:
         interval: time from the previous fixed frame to the newest [s]; inf for the first.
-        zoom_is_new: whether the newest zoom frame has a new time and a new image; an unchanged image counts as new
-            while the fixed image has not changed either since it first came.
+        zoom_is_new: whether the newest zoom frame has a new time and is not repeated; a repeated one counts as new
+            while the fixed frames have been repeated too since it first came.
     """
 
     def __init__(self, fixed: Camera, zoom: Camera, clock: Clock) -> None:
@@ -117,7 +117,7 @@ class FrameSource:
             raise StaleFrameError(f"the fixed camera's frame is from {ahead:.2f} s in the future; mind the clock")
         if now > until:  # its times jumped back and have now reached the last one
             raise StaleFrameError(self._fixed_fault)
-        if before is None or not _is_same(frame.image, before.image):
+        if before is None or not frame.repeated:
             self._fixed_changed_t = frame.t
         self.interval = frame.t - self._fixed_t
         self._fixed_frame, self._fixed_t, self._read_t = frame, frame.t, now
@@ -141,7 +141,7 @@ class FrameSource:
         if is_later:
             _check_size(frame, self._zoom, "zoom")
             self._zoom_frame, self._zoom_t = frame, self._fixed_t
-            if before is None or not _is_same(frame.image, before.image):
+            if before is None or not frame.repeated:
                 self._zoom_changed_t = self._fixed_t
         self.zoom_is_new = is_later and not self._fixed_changed_t > self._zoom_changed_t
         if before is None or is_later:
@@ -153,8 +153,7 @@ class FrameSource:
     def faults(self) -> list[str]:
         """Describe what is wrong with the newest frames, one message each.
 
-        Images that stay the same to the last bit for `READ_TIMEOUT_S` are reported, because those of a live camera have
-        noise.
+        Frames that are repeated for `READ_TIMEOUT_S` are reported.
         """
         found = []
         if self._fixed_fault:
@@ -186,11 +185,6 @@ def _check_size(frame: Frame, camera: Camera, name: str) -> None:
             f"the {name} camera gave a frame of {width}x{height}, and not of {was_width}x{was_height}: set it back, or "
             "open the rig again"
         )
-
-
-def _is_same(a: Image, b: Image) -> bool:
-    """Whether two images are the same to the last bit; those of a live camera differ in the first row already."""
-    return a is b or (np.array_equal(a[0], b[0]) and np.array_equal(a, b))
 
 
 class State(enum.StrEnum):

@@ -32,10 +32,17 @@ FUTURE_S = 0.05
 
 @dataclass(frozen=True)
 class Frame:
-    """One image with its time: ``image`` (H, W, 3) BGR, ``t`` the middle of the exposure [s]."""
+    """One image with its time.
+
+    Attributes:
+        image: (H, W, 3) BGR.
+        t: middle of the exposure [s].
+        repeated: whether its camera is known to repeat the image before, with a new time.
+    """
 
     image: Image
     t: float
+    repeated: bool = False
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ the stream ends. Callers get errors from `read`.
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -87,7 +87,7 @@ class FrameBuffer:
         self._changed = threading.Condition()
         self._counts = FrameCounts()
         self._newest: _Newest | None = None
-        self._last: bytes | Image | None = None  # the newest data, kept even if they cannot be decoded
+        self._last: Hashable = None  # what tells the newest frame from a repeated one, even if it cannot be decoded
         self._new_at = self._heard_at = clock.now()  # arrival of the newest frame, and of anything
         self._frozen = False  # whether the newest frame was repeated
         self._refused = ""  # why frames were refused since the newest one
@@ -150,31 +150,45 @@ class FrameBuffer:
         with self._changed:
             self._heard_at = self._clock.now()
 
-    def put(self, data: bytes | Image, arrived: float, took: float = 0.0) -> bool:
-        """Publish a frame.
+    def put(
+        self,
+        data: bytes | Image,
+        arrived: float,
+        took: float = 0.0,
+        *,
+        t: float | None = None,
+        serial: Hashable = None,
+    ) -> bool:
+        """Publish a frame, unless its serial, its own time or else its JPEG is that of the last one.
+
+        Equal images without these are new: a video codec repeats the picture of a quiet scene to the last bit.
 
         Args:
             data: the image, (H, W, 3) BGR, or its JPEG; not changed any more.
-            arrived: time of arrival [s]; the frame's time is this less the latency.
+            arrived: time of arrival [s]; the frame's time is this less the latency, where it has no ``t``.
             took: how long the frame took to arrive [s].
+            t: middle of the exposure by the stream's own clock, mapped to the rig's [s].
+            serial: what identifies the frame, such as its number or the stream's own time stamp.
 
         Returns:
             Whether the frame is a new one, and not the last one repeated.
         """
         with self._changed:
             self._heard_at = max(self._heard_at, arrived)
-            if self._last is not None and _equal(data, self._last):
+            own = t if serial is None else serial
+            own = data if own is None and not isinstance(data, np.ndarray) else own
+            if own is not None and own == self._last:
                 self._counts = replace(self._counts, repeated=self._counts.repeated + 1)
                 self._frozen = True
                 return False
-            self._last = data
+            self._last = own
             if took > self._fresh_s:
                 self._refuse(f"its frames take {took:.2g} s to come", 1)
                 return True
             skipped = 1 if self._newest is not None and not self._newest.read else 0
             counts = self._counts
             self._counts = replace(counts, frames=counts.frames + 1, skipped=counts.skipped + skipped)
-            self._newest = _Newest(data, arrived - self._latency_s, arrived, self._new_at)
+            self._newest = _Newest(data, arrived - self._latency_s if t is None else t, arrived, self._new_at)
             self._new_at = arrived
             self._frozen, self._refused, self._remark = False, "", ""
             self._changed.notify_all()
@@ -370,10 +384,3 @@ class BufferedCamera:
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
         """Wait for a frame, see `FrameBuffer.read`."""
         return self._frames.read(newer_than, timeout)
-
-
-def _equal(data: bytes | Image, other: bytes | Image) -> bool:
-    """Return whether two frames are equal as they came."""
-    if isinstance(data, np.ndarray) or isinstance(other, np.ndarray):
-        return isinstance(data, np.ndarray) and isinstance(other, np.ndarray) and np.array_equal(data, other)
-    return data == other

@@ -22,11 +22,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from cotarget.config import RigConfig, parse_config
 from cotarget.control.selection import check_selector_table
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform
-from cotarget.rig import CameraSpec, Frame, HeadSpec, PanTiltLimits, PanTiltState, RigSpec, ZoomSpec, ZoomState
+from cotarget.rig import CameraSpec, Frame, HeadSpec, Image, PanTiltLimits, PanTiltState, RigSpec, ZoomSpec, ZoomState
 
 SCHEMA = 1
 META, LOG, CALIBRATION, TEMPLATE = "recording.json", "log.jsonl", "calibration.json", "template"
@@ -66,6 +68,7 @@ class Event:
         error: the exception's name and message if the call failed.
         error_class: name of its nearest base class in `cotarget.errors`, for an exception of another module.
         aside: whether another thread than the run's own called, such as a watchdog.
+        repeated: whether a frame repeats the one before, where comparing their images says otherwise.
     """
 
     call: str
@@ -77,6 +80,7 @@ class Event:
     error: tuple[str, str] | None = None
     error_class: str = ""
     aside: bool = False
+    repeated: bool | None = None
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -127,6 +131,8 @@ def event_line(event: Event) -> str:
             row["error_class"] = event.error_class
     if event.aside:
         row["aside"] = True
+    if event.repeated is not None:
+        row["repeated"] = event.repeated
     return json.dumps(row, allow_nan=False)
 
 
@@ -155,7 +161,13 @@ def parse_event(row: Mapping[str, Any]) -> Event:
     at = float(row["at"])
     if not math.isfinite(at):
         raise ValueError("at is not finite")
-    return Event(call, at, args, result, image, size, error, str(row.get("error_class", "")), row.get("aside") is True)
+    named, aside, repeated = str(row.get("error_class", "")), row.get("aside") is True, row.get("repeated")
+    return Event(call, at, args, result, image, size, error, named, aside, None if repeated is None else bool(repeated))
+
+
+def is_same(a: Image, b: Image) -> bool:
+    """Whether two images are the same to the last bit; noise differs in the first row already."""
+    return a is b or (np.array_equal(a[0], b[0]) and np.array_equal(a, b))
 
 
 def spec_table(spec: RigSpec) -> dict[str, Any]:

@@ -42,6 +42,7 @@ from cotarget.recording.format import (
     Event,
     argument_numbers,
     event_line,
+    is_same,
     result_numbers,
     spec_table,
 )
@@ -96,13 +97,16 @@ class RecordWriter:
         self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
         self._thread.start()
 
-    def put(self, event: Event | dict[str, Any], camera: str = "", image: Image | None = None) -> None:
+    def put(self, event: Event | dict[str, Any], camera: str = "", frame: Frame | None = None) -> None:
         """Queue a line of the log; the image of an event's frame goes to the camera's folder and must not change."""
         with self._changed:
             file = None
-            if image is not None and not self.failure:
+            if frame is not None and not self.failure:
                 assert isinstance(event, Event)
-                file = self._file_of(camera, image, event.numbers[0])
+                last_t, last, _ = self._last.get(camera, (-math.inf, None, None))
+                if frame.t > last_t and frame.repeated != (last is not None and is_same(frame.image, last)):
+                    event = replace(event, repeated=frame.repeated)
+                file = self._file_of(camera, frame.image, frame.t)
             if not self.failure:  # checked again: it may have failed during the wait for room
                 self._queue.append((event, file))
                 self._changed.notify_all()
@@ -213,8 +217,8 @@ class _CallLog:
             raise
         result = result_numbers(answer)
         at = answer if name == "clock.now" else self._clock.now()
-        image = answer.image if isinstance(answer, Frame) else None
-        self._writer.put(Event(name, at, args, result, aside=aside), name.split(".")[0], image)
+        frame = answer if isinstance(answer, Frame) else None
+        self._writer.put(Event(name, at, args, result, aside=aside), name.split(".")[0], frame)
         return answer
 
 

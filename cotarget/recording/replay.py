@@ -22,7 +22,7 @@ import numpy as np
 import cotarget.errors
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
-from cotarget.recording.format import COMPLETE, Event, Recording, argument_numbers
+from cotarget.recording.format import COMPLETE, Event, Recording, argument_numbers, is_same
 from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Rig, Speed, ZoomState
 
 COMMANDS = ("head.move", "zoom.zoom", "head.halt")
@@ -335,6 +335,7 @@ class _Camera:
     def __init__(self, replay: Replay, directory: Path, size: tuple[int, int]) -> None:
         self._replay, self._directory, self._size = replay, directory, size
         self._newest: tuple[str, Image] | None = None
+        self._last: Frame | None = None  # by its exposure time
 
     @property
     def size(self) -> tuple[int, int]:
@@ -352,7 +353,13 @@ class _Camera:
             image = np.asarray(read, dtype=np.uint8)
             image.flags.writeable = False
             self._newest = (name, image)
-        return Frame(image, event.numbers[0])
+        last, repeated = self._last, event.repeated
+        if repeated is None:
+            repeated = last is not None and is_same(image, last.image)
+        frame = Frame(image, event.numbers[0], repeated)
+        if last is None or frame.t > last.t:
+            self._last = frame
+        return frame
 
 
 class _FixedCamera(_Camera):

@@ -60,18 +60,41 @@ def test_the_newest_frame_is_read_with_the_time_of_its_exposure(bench, encode):
     assert (bench.frames.counts.frames, bench.frames.counts.skipped) == (3, 2)
 
 
-@pytest.mark.parametrize("encode", [image, jpeg])
-def test_a_repeated_frame_is_no_new_one(bench, encode):
-    bench.put(encode(10))
+@pytest.mark.parametrize(
+    ("encode", "own", "again"),
+    [(jpeg, {}, {}), (image, {"t": 99.5}, {"t": 99.5}), (jpeg, {"serial": 7, "t": 99.5}, {"serial": 7, "t": 99.6})],
+)
+def test_a_repeated_frame_is_no_new_one(bench, encode, own, again):
+    bench.put(encode(10), **own)
     t = bench.read().t
     for _ in range(20):
-        assert not bench.put(encode(10))
+        assert not bench.put(encode(10), **again)
     assert bench.frames.counts.repeated == 20
     assert bench.frames.frozen_s == pytest.approx(20 * 0.04)
     assert "repeats the same picture" in bench.why(t)
     bench.put(encode(11))
     assert bench.read(t).t > t
     assert bench.frames.frozen_s == 0.0
+
+
+@pytest.mark.parametrize(
+    ("encode", "own"),
+    [
+        (image, lambda i: {}),
+        (image, lambda i: {"t": 99 + i / 15}),
+        (jpeg, lambda i: {"t": 99 + i / 15}),
+        (jpeg, lambda i: {"serial": i}),
+    ],
+)
+def test_a_picture_that_a_live_stream_repeats_is_a_new_frame(bench, encode, own):
+    """A video codec repeats the picture of a quiet scene to the last bit."""
+    t = -math.inf
+    for i in range(20):
+        assert bench.put(encode(10), **own(i))
+        expected = own(i).get("t", bench.clock.t - LATENCY_S)
+        t = bench.read(t).t
+        assert t == expected
+    assert bench.frames.counts.repeated == bench.frames.frozen_s == 0
 
 
 def test_an_old_frame_is_none():
@@ -89,7 +112,7 @@ REASONS = {
     "cut short": (lambda bench: bench.frames.refuse(2), "broken", 2),
     "late": (lambda bench: bench.put(image(20), took=2 * FRESH_S), "take 1 s to come", 1),
     "late, and again in time": (
-        lambda bench: (bench.put(image(20), took=2 * FRESH_S), bench.put(image(20))),
+        lambda bench: (bench.put(jpeg(20), took=2 * FRESH_S), bench.put(jpeg(20))),
         "take 1 s to come",
         1,
     ),

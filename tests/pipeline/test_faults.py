@@ -223,14 +223,14 @@ def test_frames_that_change_their_size(camera):
     assert_it_comes_to_rest(rig, steps[-1].t)
 
 
-def frozen(rig, camera, since=FAULT):
+def frozen(rig, camera, since=FAULT, repeated=True):
     """A rig one of whose cameras gives its first picture again from a fault on, with new times."""
     kept = []
 
     def change(read, t, newer_than, timeout):
         frame = read(newer_than, timeout)
         kept.append(frame.image)
-        return replace(frame, image=kept[0].copy()) if t > since else frame
+        return replace(frame, image=kept[0].copy(), repeated=repeated) if t > since else frame
 
     setattr(rig, camera, Faulty(getattr(rig, camera), change))
     return rig
@@ -329,6 +329,16 @@ def test_a_zoom_picture_that_stays_the_same_is_told_and_not_looked_at_again():
     assert {step.state for step in reported} == {State.FOLLOWING}
     assert len(asked.times) > 1.0 * RATE_HZ  # until then at every frame
     assert asked.times[-1] == pytest.approx(FAULT, abs=2 * FRAME_S + LATENCY)
+
+
+def test_pictures_that_stay_the_same_are_looked_at_where_the_camera_works():
+    """A video codec repeats the picture of a quiet scene to the last bit."""
+    rig, asked = FormulaRig(), Asked()
+    for camera in ("fixed", "zoom"):
+        frozen(rig, camera, repeated=False)
+    steps = run(rig, Seer(crossing), FAULT + 2.0, finder=lambda *_: asked)
+    assert asked.times[-1] == steps[-1].zoom.t
+    assert not [step for step in steps if "the same picture" in step.reason]
 
 
 def test_pictures_that_stay_the_same_in_both_views_are_looked_at():

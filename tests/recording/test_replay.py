@@ -37,6 +37,7 @@ from tests.support.recorded_run import (
     STEP,
     Bright,
     ToyDevices,
+    ToyZoomCamera,
     calibration,
     calibration_file,
     record,
@@ -109,6 +110,34 @@ def test_the_same_pipeline_replays_to_the_last_bit(recorded):
     assert differences.zooms > 2
     limited, _ = replay(folder, seconds=SECONDS)  # the recorded clock ends the run as it did then
     assert len(limited) == len(steps)
+
+
+class Repeating(ToyZoomCamera):
+    """Gives each picture three times, and says so the third time."""
+
+    def read(self, newer_than=None, timeout=1.0):
+        frame = super().read(newer_than, timeout)
+        return dataclasses.replace(frame, repeated=round(frame.t * self.rate_hz) % 3 == 2)
+
+    def expose(self, index):
+        return super().expose(index // 3)
+
+
+def test_frames_are_repeated_as_their_camera_said(tmp_path):
+    """Earlier versions compared the pictures: where the log does not say otherwise, a replay does."""
+    devices = ToyDevices()
+    devices.zoom = Repeating(devices, "zoom", RATE_HZ)
+    steps = record(tmp_path / "run", calibration_file(tmp_path), devices, seconds=1.0)
+    again, differences = replay(tmp_path / "run")
+    assert_same(steps, again)
+    assert differences.same
+    assert {step.zoom.repeated for step in steps} == {True, False}
+    log = lines(tmp_path / "run")
+    assert {b"repeated" in line for line in log if b"zoom.read" in line} == {True, False}
+    (tmp_path / "run" / "log.jsonl").write_bytes(re.sub(rb', "repeated": \w+', b"", b"".join(log)))
+    older, _ = replay(tmp_path / "run")
+    same = [np.array_equal(a.zoom.image, b.zoom.image) for a, b in itertools.pairwise(steps)]
+    assert [step.zoom.repeated for step in older] == [False, *same]
 
 
 def test_a_rig_in_real_time_replays_to_the_last_bit(tmp_path):
