@@ -372,7 +372,8 @@ def _add_inspection(command: Command) -> None:
     _add_insist(view)
     view.add_argument("--browser", action="store_true", help="serve a page for a web browser on this machine")
     view.add_argument("--port", type=port, metavar="P", help=f"port of the page; 0: any free one ({running.PORT})")
-    view.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")
+    about = "duration by the clock on the wall [s] (until it is closed, or Ctrl-C)"
+    view.add_argument("--seconds", type=duration, metavar="S", help=about)
 
     detect = command("detect", running.detect_command, "run the fixed camera's detector and tracker on any video")
     _add_file(detect, "film", "video to search, or with --labels a folder of videos", "VIDEO")

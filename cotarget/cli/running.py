@@ -60,23 +60,34 @@ def view_command(options: argparse.Namespace) -> None:
     with closing(world), closing(opened(world.truth())) as window:
         print(f"{window.where} shows the scene; Ctrl-C ends it", file=sys.stderr, flush=True)
         try:
-            watch(_snapshots(options, config, world, calibration), window, time.monotonic, time.sleep)
+            seconds = math.inf if options.seconds is None else options.seconds
+            watch(_snapshots(options, config, world, calibration), window, time.monotonic, time.sleep, seconds)
         except KeyboardInterrupt:
             print("", file=sys.stderr)
 
 
 def watch(
-    snapshots: "Iterator[Snapshot]", window: Any, now: Callable[[], float], sleep: Callable[[float], None]
+    snapshots: "Iterator[Snapshot]",
+    window: Any,
+    now: Callable[[], float],
+    sleep: Callable[[float], None],
+    seconds: float = math.inf,
 ) -> None:
-    """Show snapshots no faster than in real time, until they end or the window is closed."""
-    ahead = math.inf  # lead of the rig's clock over the wall clock
+    """Show snapshots no faster than in real time, until they end, the window is closed, or the wall clock's time is up.
+
+    The wall clock starts at the time of the first snapshot.
+    """
+    ahead, end = math.inf, None  # lead of the rig's clock over the wall clock, and the wall clock's end
     for snapshot in snapshots:
         window.show(snapshot)
+        end = now() + seconds - snapshot.t if end is None else end
         if not window.is_open():
             return
         ahead = min(ahead, snapshot.t - now())  # a slow machine does not catch up afterwards
         if (wait := snapshot.t - ahead - now()) > 0:
             sleep(wait)
+        if now() >= end:
+            return
 
 
 def _config(options: argparse.Namespace) -> "RigConfig":

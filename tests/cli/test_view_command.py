@@ -103,6 +103,14 @@ def test_snapshots_are_shown_in_real_time_without_catching_up():
     np.testing.assert_allclose(clock.now(), 0.8)
 
 
+def test_a_slow_machine_is_watched_for_as_long_as_a_fast_one():
+    """Each snapshot takes 0.5 s, the first one included, and is 0.1 s after the one before."""
+    clock = WallClock()
+    window = Window(clock)
+    running.watch(moments(clock, [0.5] * 100), window, clock.now, clock.sleep, 2.0)
+    assert window.shown[-1][1] == clock.now() == pytest.approx(0.5 + 2.0)
+
+
 @pytest.mark.parametrize("target", [(), ("--target", "book")])
 def test_view_shows_the_rig_at_rest_or_the_pipeline(tmp_path, capsys, monkeypatch, target):
     clock, shown = WallClock(), []
