@@ -593,7 +593,8 @@ def _check_angles(alpha: Array, beta: Array) -> None:
         i = int(np.argsort(off)[len(off) // 2])
         raise CalibrationError(
             f"hand-eye: the head reports a turn of {np.degrees(head[i]):.1f} degrees where the zoom camera turned by "
-            f"{np.degrees(camera[i]):.1f}; check the head's units and that the camera is fastened to it"
+            f"{np.degrees(camera[i]):.1f}; check the head's units, that the camera is fastened to it, and that "
+            "the board is flat"
         )
 
 

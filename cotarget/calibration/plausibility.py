@@ -49,7 +49,7 @@ def check_plausible(calibration: Calibration, spec: RigSpec | None = None, *, in
         ConfigError: a stream has another aspect ratio than that calibrated.
     """
     if not insist and (text := implausibility(calibration, spec)):
-        raise CalibrationError(f"{text}; insist=True uses it all the same")
+        raise CalibrationError(f"calibration: {text}; insist=True uses it all the same")
 
 
 def implausibility(calibration: Calibration, spec: RigSpec | None = None) -> str:

@@ -62,10 +62,17 @@ def advice(calibration: Calibration, found: Analysis) -> list[str]:
     """Advise how to improve a calibration, roughly the most useful first; empty where nothing stands out."""
     at, evidence = found.at, found.evidence
     items = [*_disagreement(calibration), *_missing(calibration), *_unconfirmed(calibration)]
-    items += [*_largest_part(at, found.parts), *_between_stops(at, found.between), *_worst_corner(calibration, at)]
+    wrong_board = evidence is not None and evidence.shape.wrong
+    if evidence is not None and wrong_board:
+        items.append(_another_board(evidence.shape))
+    else:
+        items += _largest_part(at, found.parts)
+    items += [*_between_stops(at, found.between), *_worst_corner(calibration, at)]
     if evidence is not None:
-        items += [*_images(calibration, evidence), *_patterns(evidence), *_situation(calibration, evidence)]
-        items += _more_of_the_same(calibration, at)
+        items += _images(calibration, evidence)
+        items += [] if wrong_board else _patterns(evidence)
+        items += _situation(calibration, evidence)
+        items += [] if wrong_board else _more_of_the_same(calibration, at)
     return items
 
 
@@ -173,13 +180,21 @@ def board_in_words(shape: BoardShape) -> str:
     )
 
 
+def _another_board(shape: BoardShape) -> str:
+    """Advise on a wrong board, for which more captures of it, or another lens, are no remedy."""
+    remedy = (
+        "It is bent: mount it on something flat and rigid"
+        if shape.out > shape.within
+        else "It is stretched: print it again, and measure its squares both ways"
+    )
+    return (
+        f"{board_in_words(shape)} {remedy}, and capture all images again. More captures of this board do not help, and "
+        "the predicted error leaves its shape out."
+    )
+
+
 def _patterns(evidence: Evidence) -> Iterator[str]:
-    """Advise where the residuals show a wrong board, or a pattern in an image."""
-    if evidence.shape.wrong:
-        yield (
-            f"{board_in_words(evidence.shape)} Measure the board, and mount it on something flat: the predicted error "
-            "leaves this out."
-        )
+    """Advise where the residuals show a pattern in an image, which no shape of the board explains."""
     for name in CAMERAS:
         cells = averaged(evidence.corners[name])
         known, beyond = int(np.isfinite(cells.means[:, 0]).sum()), int(cells.beyond_chance.sum())

@@ -294,13 +294,28 @@ def test_wavy_board_is_noticed(plain):
     evidence = gather(calibration)
     assert evidence.shape.wrong
     assert evidence.shape.out == pytest.approx(np.std(bent[:, 2] - flat), rel=0.2)  # noise adds a tenth
-    found = judge(calibration)
-    assert found.level == "care"
-    assert "not counting that the board's corners are 1." in found.text
-    assert any(
-        "mount it on something flat" in item for item in advice(calibration, replace(UNKNOWN, evidence=evidence))
+    found = analyse(calibration)
+    verdict, words = judge(calibration, found), advice(calibration, found)
+    assert verdict.level == "care"
+    assert "not counting that the board's corners are 1." in verdict.text
+    (item,) = (item for item in words if "the board's 54 corners" in item)
+    assert "mount it on something flat and rigid" in item
+    assert "More captures of this board do not help" in item
+    # Nothing that more images of the same board, or another lens, would mend.
+    assert not any(
+        "more placements" in each or "known exactly" in each or "residuals have a pattern" in each for each in words
     )
+    stretched = replace(evidence.shape, offsets=evidence.shape.offsets[:, [2, 1, 0]])
+    words = advice(calibration, replace(found, evidence=replace(evidence, shape=stretched)))
+    assert any("measure its squares both ways" in item for item in words)
     assert not gather(plain).shape.wrong
+
+
+def test_board_too_bent_for_the_motions_is_suspected():
+    bent = POINTS - [[0.0, 0.0, 0.125]] * POINTS[:, :1] * (POINTS[:, :1] - 0.8)  # 20 mm in its middle
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(2), boards=12, moved=2, shape=bent)
+    with pytest.raises(CalibrationError, match=r"the head reports a turn .* that the board is flat"):
+        calibrate_views(views, BOARD, SIZES, options=UNCHECKED)
 
 
 def test_patterns_in_residuals_and_empty_corners_are_noticed():
