@@ -1,8 +1,12 @@
 """Read films that PyAV can decode, and write H.264 yuv420p films that any player and browser opens."""
 
 import contextlib
+import logging
+import math
 import os
+from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime, timedelta
 from fractions import Fraction
 from pathlib import Path
@@ -17,6 +21,8 @@ from cotarget.errors import CotargetError
 from cotarget.files import PartFile, write_all
 from cotarget.rig import Frame, Image
 from cotarget.safety.signals import DeferredSignals
+
+log = logging.getLogger(__name__)
 
 # Codecs in which a packet without a frame is normal, and those in which one smaller than FFmpeg's MAX_NVOP_SIZE [bytes]
 # repeats the frame before it.
@@ -121,6 +127,7 @@ FROM_ZERO = "matroska,webm"  # its duration counts from time 0, and not from the
 MICROSECONDS = 1e6  # FFmpeg's units of duration per second
 # Least shortfall of a film, the longer of the two: the last frame's length and edits at the end are stated roughly.
 SHORT_S, SHORT_FRAMES = 0.5, 3
+AHEAD = 3  # frames whose time stamps are looked at ahead: they outvote two wild ones in a row
 
 
 def _url(path: Path) -> str:
@@ -186,6 +193,7 @@ class Film:
         self.count: int | None = stream.frames or None
         self.number = -1
         self.shortfall = ""
+        self._damaged = False  # whether the newest decoded frame is
         self._slots = 0  # end of what was read, in frames of the stream's own time
         self._end = 0.0  # end of what was read of pictures and sound, in the film's time [s]
 
@@ -202,31 +210,69 @@ class Film:
     def __iter__(self) -> Iterator[Frame]:
         """Decode the frames in order; times are the film's own [s], or from the frame rate if it has none.
 
+        A wild time stamp is replaced, and a warning says so after the last frame: most of the next frames, or the end
+        in the film's header, go on from the time before it, and it is not between.
+
         Raises:
             CotargetError: nothing can be decoded, or the image's size changes.
         """
         places, self._slots = Places(self._container.streams.video[0]), 0
-        reason, damaged, size = "", False, self.size
+        reason = ""
         try:
-            for picture in self._pictures(places):
-                image, damaged = picture.to_ndarray(format="bgr24"), picture.is_corrupt
-                if self._turns:
-                    image = np.ascontiguousarray(np.rot90(image, self._turns))
-                if (image.shape[1], image.shape[0]) != size:
-                    raise CotargetError(
-                        f"{self.path}: the picture's size changes from {size[0]}x{size[1]} to "
-                        f"{image.shape[1]}x{image.shape[0]} at frame {places.number}; cut the film there"
-                    )
-                self.number = places.number
-                yield Frame(image, self.number / self.rate_hz if picture.time is None else float(picture.time))
+            yield from self._mended(self._decoded(places))
         except av.error.FFmpegError as error:
             reason = f" ({reason_of(error)})"
         if self.number < 0:
             raise CotargetError(
                 f"{self.path}: holds no frame that can be decoded{reason or places.reason}; give a complete film"
             )
-        ending = self._shortfall(damaged) or (f"what follows cannot be decoded{reason}" if reason else "")
+        ending = self._shortfall() or (f"what follows cannot be decoded{reason}" if reason else "")
         self.shortfall = "; ".join(filter(None, (places.describe(ended=bool(ending)), ending)))
+
+    def _decoded(self, places: Places) -> Iterator[tuple[int, Frame]]:
+        """Decode the frames with their numbers and the film's own times."""
+        size = self.size
+        for picture in self._pictures(places):
+            image, self._damaged = picture.to_ndarray(format="bgr24"), picture.is_corrupt
+            if self._turns:
+                image = np.ascontiguousarray(np.rot90(image, self._turns))
+            if (image.shape[1], image.shape[0]) != size:
+                raise CotargetError(
+                    f"{self.path}: the picture's size changes from {size[0]}x{size[1]} to "
+                    f"{image.shape[1]}x{image.shape[0]} at frame {places.number}; cut the film there"
+                )
+            number = places.number
+            yield number, Frame(image, number / self.rate_hz if picture.time is None else float(picture.time))
+
+    def _mended(self, frames: Iterator[tuple[int, Frame]]) -> Iterator[Frame]:
+        """Replace wild time stamps, see `__iter__`."""
+        waiting: deque[tuple[int, Frame]] = deque()
+        wild, end, failure = list[int](), list[float](), None
+        before, period = -math.inf, 1 / self.rate_hz
+        while True:
+            while failure is None and len(waiting) <= AHEAD:
+                try:
+                    waiting.append(next(frames))
+                except (StopIteration, CotargetError, av.error.FFmpegError) as error:
+                    failure = error
+                    if isinstance(error, StopIteration) and (stated := sum(self._stated())):
+                        end = AHEAD * [stated + max(SHORT_S, SHORT_FRAMES * period)]
+            if not waiting:
+                break
+            self.number, frame = waiting.popleft()
+            after = ([each.t for _, each in waiting] + end)[:AHEAD]
+            against = [i for i, t in enumerate(after, 1) if before < t and not before <= frame.t <= t]
+            if against and 2 * len(against) >= len(after):
+                wild.append(self.number)
+                i, t = against[0], after[against[0] - 1]
+                mended = t - i * period if math.isinf(before) else before + min(period, (t - before) / (i + 1))
+                frame = replace(frame, t=mended)
+            before = frame.t
+            yield frame
+        if wild:
+            log.warning("%s: wild time stamps, replaced: %d, the first at frame %d", self.path, len(wild), wild[0])
+        if failure is not None and not isinstance(failure, StopIteration):
+            raise failure
 
     def _pictures(self, places: Places) -> Iterator[av.VideoFrame]:
         """Decode the first video stream; packets of all streams are read to find their end."""
@@ -248,8 +294,8 @@ class Film:
                     places.take(picture)
                     yield picture
 
-    def _shortfall(self, damaged: bool) -> str:
-        """Describe what the container states beyond what was read, or that the last frame is damaged."""
+    def _stated(self) -> tuple[float, float]:
+        """Begin and duration of the film by its header [s]; 0 where it has none."""
         stream, container = self._container.streams.video[0], self._container
         begin, stated = 0.0, 0.0
         if container.format.name == "avi" and stream.frames and stream.time_base is not None:
@@ -258,13 +304,19 @@ class Film:
             stated = container.duration / MICROSECONDS
             if container.format.name != FROM_ZERO:
                 begin = (container.start_time or 0) / MICROSECONDS
+        return begin, stated
+
+    def _shortfall(self) -> str:
+        """Describe what the container states beyond what was read, or that the last frame is damaged."""
+        stream, container = self._container.streams.video[0], self._container
+        begin, stated = self._stated()
         if begin + stated - self._end > max(SHORT_S, SHORT_FRAMES / self.rate_hz):
             return f"the film says that it lasts {stated:.1f} s, and ends at {max(self._end - begin, 0.0):.1f} s"
         # In AVI every frame is a slot of its time, even an empty one; a lost frame makes the others come too early.
         if container.format.name == "avi" and (lost := stream.frames - self._slots) > 0:
             stated_count = f"of the {stream.frames} frames that it says it has {lost} are lost"
             return f"{stated_count}, and those after them come too early"
-        return "its last frame is damaged" if damaged else ""
+        return "its last frame is damaged" if self._damaged else ""
 
 
 QUALITY, PRESET = "20", "veryfast"  # of x264; see docs/design-notes.md

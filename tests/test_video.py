@@ -238,6 +238,63 @@ def test_a_film_whose_time_does_not_begin_at_zero_is_whole(tmp_path, name):
     assert film.shortfall == ""
 
 
+def stamped(path, wild):
+    """Write 30 frames from 100 s on, a cluster each, whose stamps [s] are overwritten by number."""
+    with av.open(str(path), "w", options={"cluster_time_limit": "1", "cluster_size_limit": "1"}) as film:
+        stream = film.add_stream("mjpeg", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for k in range(30):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 8 * k, np.uint8), format="bgr24")
+            frame.pts, frame.time_base = 2500 + k, Fraction(1, 25)
+            film.mux(stream.encode(frame.reformat(format="yuvj420p")))
+        film.mux(stream.encode(None))
+    data = bytearray(path.read_bytes())
+    clusters = [found.start() for found in re.finditer(rb"\x1f\x43\xb6\x75", data)]
+    assert len(clusters) == 30
+    for number, t in wild.items():
+        at = data.index(b"\xe7", clusters[number] + 4)
+        length = data[at + 1] & 0x7F
+        data[at + 2 : at + 2 + length] = round(1000 * t).to_bytes(length, "big")
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    "wild",
+    [
+        {12: 162.0},
+        {12: 3.0},
+        {12: 162.0, 13: 162.04},
+        {12: 3.04, 13: 3.0},
+        {12: 162.0, 14: 163.0, 20: 100.5},
+        {0: 162.0},
+        {0: 162.0, 1: 162.04},
+        {29: 162.0},
+        {28: 3.0, 29: 3.04},
+        {28: 162.0, 29: 162.04},
+    ],
+)
+def test_wild_time_stamps_are_replaced_and_reported_once(tmp_path, caplog, wild):
+    stamped(tmp_path / "a.mkv", wild)
+    with Film(tmp_path / "a.mkv") as film:
+        frames = [(film.number, frame) for frame in film]
+    np.testing.assert_allclose([frame.t for _, frame in frames], 100 + np.arange(30) / 25, atol=2e-3)
+    assert [number for number, _ in frames] == list(range(30))
+    assert [round(frame.image.mean() / 8) for _, frame in frames] == list(range(30))
+    (record,) = caplog.records
+    assert record.getMessage().endswith(
+        f"a.mkv: wild time stamps, replaced: {len(wild)}, the first at frame {min(wild)}"
+    )
+
+
+@pytest.mark.parametrize(("first", "jump"), [(12, 60.0), (1, 60.0), (12, -0.48), (12, -40.0)])
+def test_a_film_whose_time_jumps_and_stays_there_keeps_its_gap(tmp_path, caplog, first, jump):
+    times = 100 + np.arange(30) / 25 + np.where(np.arange(30) < first, 0.0, jump)
+    stamped(tmp_path / "a.mkv", dict(enumerate(times)))
+    with Film(tmp_path / "a.mkv") as film:
+        np.testing.assert_allclose([frame.t for frame in film], times, atol=1e-3)
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("codec", ["mpeg4", "mjpeg"])
 def test_an_avi_with_empty_chunks_has_no_shortfall(tmp_path, codec):
     """Where none comes a chunk is empty, and counts as a frame of those that the file says it has."""
