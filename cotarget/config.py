@@ -602,7 +602,7 @@ def config_of(text: str, path: Path) -> RigConfig:
     """
     table = _tables(text, path)
     try:
-        config = parse_config(table, path.parent.absolute())  # the program may change its working directory
+        config = parse_config(table, path.parent)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     stop_file = locate_stop_file(path, config.backend, table.get("safety", {}).get("stop_file"))
