@@ -1,10 +1,11 @@
-"""Run long jobs in separate processes, which end with their parent."""
+"""Run long jobs in separate processes, which end with their parent, and show their progress."""
 
 import contextlib
 import ctypes
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection, wait
@@ -15,11 +16,31 @@ from cotarget.errors import CotargetError
 Result = TypeVar("Result")
 # Called with the amount done, the total (None if it is unknown), and a text.
 Progress = Callable[[float, float | None, str], object]
+LONGEST_LINE = 79  # of a terminal, which would wrap a longer one
+CLEAR = "\r\x1b[K"  # erases a terminal's line
 ORPHANED = 1  # exit status of a process whose parent has ended
 # Parameters of glibc's mallopt: one arena for all threads, and a separate mapping for each block of at least MAPPED
 # bytes, whose memory is free when the block is. The demo then needs 470 to 520 MB in place of 570.
 M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
 MAPPED = 262144
+
+
+@contextlib.contextmanager
+def progress_line(given: Progress | None) -> Iterator[Progress]:
+    """Show progress as a user wants it; by default as a line of stderr, erased in the end, if that is a terminal."""
+
+    def write(text: str) -> None:
+        with contextlib.suppress(OSError):  # a closed terminal does not end the work
+            sys.stderr.write(CLEAR + text[:LONGEST_LINE])
+            sys.stderr.flush()
+
+    if given is not None or not sys.stderr.isatty():
+        yield given or (lambda *_: None)
+        return
+    try:
+        yield lambda done, total, text: write(f"{100 * done / total:.0f} % {text}" if total else text)
+    finally:
+        write("")
 
 
 def run_apart(job: Callable[..., Result], arguments: tuple[Any, ...], report: Callable[..., object]) -> Result:

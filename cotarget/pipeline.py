@@ -274,6 +274,11 @@ class Step:
     lens_commands: int = 0
     skipped: int = 0
 
+    def __str__(self) -> str:
+        """Say the time, the state with its reason, and the aim."""
+        reason = f" ({self.reason})" if self.reason else ""
+        return f"{self.t:.2f} s: {self.state}{reason}" + (f": {self.aim}" if self.aim is not None else "")
+
 
 def follow(
     rig: Rig,

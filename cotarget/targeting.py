@@ -82,6 +82,14 @@ class Aim:
     x_fixed: Array
     range: float
 
+    def __str__(self) -> str:
+        """Say the angles in degrees, the focal length and the depth."""
+        limited = ", the lens's limit" if self.limited else ""
+        return (
+            f"pan {math.degrees(self.pan):z.2f} degrees, tilt {math.degrees(self.tilt):z.2f} degrees, "
+            f"focal length {self.focal_px:.0f} px{limited}, depth {self.depth:.2f} m"
+        )
+
     @property
     def depth(self) -> float:
         """Depth along the fixed camera's optical axis [m]."""

@@ -16,6 +16,7 @@ from cotarget.rig import CameraSpec, HeadSpec, RigSpec, ZoomSpec
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import (
     METHODS,
+    Aim,
     Reach,
     WantedSize,
     aim,
@@ -323,3 +324,9 @@ BOOK, PERSON, BIRD = (DEFAULT_TARGETS[name] for name in ("book", "person", "bird
 def test_target_that_is_none_or_that_no_lens_shows_is_implausible(target, name, rig, key):
     found = target_implausibility(target, HOME, rig, name)
     assert found.startswith(f"{key}: ") if key else not found
+
+
+def test_an_aim_prints_in_degrees():
+    found = Aim(math.radians(-12.345), math.radians(3.0), 1834.2, 1800.0, False, np.array([1.0, 2.0, 9.0]), 9.4)
+    assert str(found) == "pan -12.35 degrees, tilt 3.00 degrees, focal length 1834 px, depth 9.00 m"
+    assert "1834 px, the lens's limit, depth" in str(replace(found, limited=True))

@@ -49,7 +49,7 @@ from cotarget.calibration.session import capture_session
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array
-from cotarget.parallel import Progress
+from cotarget.parallel import Progress, progress_line
 from cotarget.rig import Rig, opened_from
 
 log = logging.getLogger(__name__)
@@ -300,7 +300,7 @@ def calibrate_captures(
     Args:
         directory: folder with index.json and its images.
         options: options of the calibration.
-        progress: called with the number done, the total, and a text.
+        progress: as in `calibrate`.
 
     Raises:
         CalibrationError: a file is missing or malformed, or the views do not determine the rig.
@@ -326,7 +326,7 @@ def calibrate_photos(
         zoom_glob: pattern of the zoom camera's files, taken at pan = tilt = 0 or without a head.
         board: the board in the photos.
         options: options of the calibration.
-        progress: called with the number done, the total, and a text.
+        progress: as in `calibrate`.
 
     Raises:
         CalibrationError: there are no pairs, or they do not determine the cameras.
@@ -352,18 +352,18 @@ def _calibrate_images(
     for camera in CAMERAS:
         if not any(capture.camera == camera for capture in index.captures):
             raise CalibrationError(f"{directory}: has no capture of the {camera} camera; both cameras are needed")
-    views, unusable, sizes = find_views(directory, index, progress, options)
-    if progress is not None:
-        progress(len(index.captures), len(index.captures), "fitting")
-    return calibrate_views(
-        views,
-        index.board,
-        sizes,
-        pitch_mm=index.pitch_mm,
-        options=options,
-        rejected=(*rejected, *unusable),
-        provenance={what: str(directory), "images": len(index.captures)},
-    )
+    with progress_line(progress) as show:
+        views, unusable, sizes = find_views(directory, index, show, options)
+        show(len(index.captures), len(index.captures), "fitting")
+        return calibrate_views(
+            views,
+            index.board,
+            sizes,
+            pitch_mm=index.pitch_mm,
+            options=options,
+            rejected=(*rejected, *unusable),
+            provenance={what: str(directory), "images": len(index.captures)},
+        )
 
 
 def _enough_stops(wanted: int, focal_range_px: tuple[float, float]) -> int:
@@ -389,7 +389,7 @@ def calibrate(
     seed: int = 0,
     options: Options = DEFAULT_OPTIONS,
 ) -> Calibration:
-    """Drive a rig through a capture session, and calibrate it from the views.
+    """Drive a rig through a capture session, and calibrate it from the views, which takes minutes.
 
     The zoom camera takes full stills where it has them.
 
@@ -397,7 +397,8 @@ def calibrate(
         rig: rig to calibrate; no earlier calibration is needed.
         board: the board in use; None for that of the rig's configuration.
         captures_dir: folder for the images; None to keep none.
-        progress: called with the number done, the total, and a text.
+        progress: called with the number done, the total, and a text; by default a line on stderr, if that is a
+            terminal.
         placements: number of placements of the board at the shortest focal length, at least 7.
         stops: number of zoom samples, evenly spread over the logarithm of the lens's range, and more where they would
             be too far apart; 1 for the shortest alone.
@@ -414,7 +415,6 @@ def calibrate(
     stops = _enough_stops(stops, rig.zoom.focal_range)
     recorder = CaptureRecorder(rig, board, captures_dir)
     rng = np.random.default_rng(seed)
-    capture_session(recorder, placements, rng, progress, stops=stops, far_placements=far_placements)
     provenance = {
         "rig": type(rig).__name__,
         "seed": seed,
@@ -423,12 +423,14 @@ def calibrate(
         "far_placements": far_placements,
         "focal_range_px": [float(focal) for focal in rig.zoom.focal_range],
     }
-    return calibrate_views(
-        recorder.views,
-        board,
-        {"fixed": rig.fixed.size, "zoom": rig.zoom.size},
-        pitch_mm=rig.spec.zoom.pitch_mm,
-        options=options,
-        rejected=recorder.rejected,
-        provenance=provenance | ({} if captures_dir is None else {"captures": str(captures_dir)}),
-    )
+    with progress_line(progress) as show:
+        capture_session(recorder, placements, rng, show, stops=stops, far_placements=far_placements)
+        return calibrate_views(
+            recorder.views,
+            board,
+            {"fixed": rig.fixed.size, "zoom": rig.zoom.size},
+            pitch_mm=rig.spec.zoom.pitch_mm,
+            options=options,
+            rejected=recorder.rejected,
+            provenance=provenance | ({} if captures_dir is None else {"captures": str(captures_dir)}),
+        )

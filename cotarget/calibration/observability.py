@@ -30,6 +30,7 @@ NO_FOCAL_PX: Mapping[str, float] = MappingProxyType({})
 NO_SIZES: Mapping[str, tuple[int, int]] = MappingProxyType({})
 TILT_BOARDS = "tilt the boards against the camera by 20 to 40 degrees, in several directions"
 OUTWARD = "show boards out to the image's corners"
+FARTHER = "show a larger board farther away, where the head reaches and the fixed camera still finds it"
 BOTH = "show both cameras the same placements, near and far"
 NEARER = "move both pan and tilt further, with boards nearer"
 # Name of each parameter in messages, and the advice that determines it.

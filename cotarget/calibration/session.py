@@ -38,6 +38,7 @@ from cotarget.calibration.joint import (
     with_stop,
 )
 from cotarget.calibration.model import BundleModel, CameraName, Rejected, View
+from cotarget.calibration.observability import FARTHER
 from cotarget.calibration.planning import (
     Coverage,
     Missed,
@@ -494,7 +495,7 @@ def _stops_without_views(recorder: CaptureRecorder, stops: Sequence[float]) -> l
     half = np.log(stops[1] / stops[0]) / 2
     seen = np.log([view.focal_px for view in recorder.views if view.camera == "zoom" and view.focal_px is not None])
     return [
-        Rejected(f"zoom stop at {stop:.0f} px", "no part of a board was seen there; hold boards where the head reaches")
+        Rejected(f"zoom stop at {stop:.0f} px", f"no part of a board was seen there; {FARTHER}")
         for stop in stops[1:]
         if not (np.abs(seen - np.log(stop)) < half).any()
     ]

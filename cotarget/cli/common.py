@@ -8,6 +8,7 @@ import json
 import math
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -84,13 +85,15 @@ def check_board_size(rig: Path, config: "RigConfig") -> None:
 # Progress and results
 
 PROGRESS_LINE_S = 30.0  # interval of lines of progress where stderr is not a terminal [s]
+REPEAT_S = 0.5  # interval at which it is seen whether a step takes that long [s]
 
 
 @contextmanager
 def progress_bar(now: Callable[[], float] = time.monotonic) -> "Iterator[Progress]":
     """Show progress on stderr: a bar on a terminal, otherwise an occasional line."""
     if not sys.stderr.isatty():
-        yield _progress_lines(now)
+        with _progress_lines(now) as show_line:
+            yield show_line
         return
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -107,12 +110,16 @@ def progress_bar(now: Callable[[], float] = time.monotonic) -> "Iterator[Progres
         yield show
 
 
-def _progress_lines(now: Callable[[], float]) -> "Progress":
-    """Print progress as lines, at most one every half a minute, so that short work prints nothing."""
+@contextmanager
+def _progress_lines(now: Callable[[], float]) -> "Iterator[Progress]":
+    """Print progress as a line every half a minute, also in a long step; short work prints nothing."""
     begin = last = now()
+    newest: tuple[float, float | None, str] | None = None
+    ended = threading.Event()
 
     def show(done: float, total: float | None, text: str) -> None:
-        nonlocal last
+        nonlocal last, newest
+        newest = done, total, text
         if (t := now()) - last < PROGRESS_LINE_S:
             return
         last = t
@@ -120,7 +127,18 @@ def _progress_lines(now: Callable[[], float]) -> "Progress":
             part = "" if total is None else f"{100 * min(done / max(total, 1), 1):.0f} %, "
             print(f"{text} ({part}{t - begin:.0f} s)", file=sys.stderr, flush=True)
 
-    return show
+    def repeat() -> None:
+        while not ended.wait(REPEAT_S):
+            if newest is not None:
+                show(*newest)
+
+    repeating = threading.Thread(target=repeat, name="progress", daemon=True)
+    repeating.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        repeating.join()
 
 
 def print_json(table: Any, csv: Path | None = None) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from cotarget.calibration.bundle import LENS_NAMES
 from cotarget.calibration.file import Calibration
 from cotarget.calibration.model import CAMERAS
-from cotarget.calibration.observability import BOTH, NEARER, OUTWARD, TILT_BOARDS, listed
+from cotarget.calibration.observability import BOTH, FARTHER, NEARER, OUTWARD, TILT_BOARDS, listed
 from cotarget.calibration.planning import distance
 from cotarget.camera import Intrinsics
 from cotarget.geometry import RigidTransform
@@ -240,8 +240,7 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
     if (longest := uncalibrated_px(calibration)) is not None:
         yield (
             f"The lens goes to a nominal {longest:.0f} px, but was calibrated to {lens.nominal_px[-1]:.0f} px: no part "
-            "of a board was seen beyond. Hold boards far away where the head reaches, with squares that still show "
-            "several corners there."
+            f"of a board was seen beyond. To calibrate these too, {FARTHER}: several corners must be in the zoom image."
         )
     zooms = any(view.focal_px is not None for view in evidence.views if view.camera == "zoom")
     if zooms and len(lens.stops) == 1:
@@ -565,7 +564,9 @@ def judge(calibration: Calibration, found: Analysis | None = None) -> Verdict:
     if at[-1].rms_px > FAR_OFF * width:
         doubts.append(f"that is {percent(at[-1].rms_px / width)} of the close-up's width")
     if (longest := uncalibrated_px(calibration)) is not None:
-        doubts.append(f"the lens goes to {longest:.0f} px and is not calibrated beyond these")
+        doubts.append(
+            f"the lens goes to {longest:.0f} px and is not calibrated beyond these; to calibrate them too, {FARTHER}"
+        )
     if calibration.jitter:
         doubts.append(_jitter(calibration, at[-1]))
     if evidence is not None and evidence.shape.wrong:

@@ -1,9 +1,11 @@
 """Sessions on a rig that draws its own boards: from knowing nothing to a calibration, and everything that can fail."""
 
 import contextlib
+import io
 import itertools
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -298,3 +300,18 @@ def test_an_interrupted_session_halts_the_head_first_and_keeps_its_captures(tmp_
     assert made.log == ["halt", "board"]
     assert (tmp_path / INDEX).exists()
     assert "while the session was broken off: the board holder is gone" in caplog.text
+
+
+@pytest.mark.parametrize(("terminal", "given"), [(True, False), (False, False), (True, True)])
+def test_calibration_shows_one_line_of_progress_on_a_terminal(terminal, given, monkeypatch):
+    """By default; anything else gets it by a function of its own."""
+    monkeypatch.setattr("sys.stderr", stderr := io.StringIO())
+    stderr.isatty = lambda: terminal
+    seen, rig = [], SyntheticRig()
+    rig.board = SimpleNamespace(present=lambda T_fixed_board: None, patience=0.0)
+    with pytest.raises(CalibrationError, match="does not see the 9x6 board"):
+        calibrate(rig, BOARD, progress=(lambda *what: seen.append(what)) if given else None)
+    shown = stderr.getvalue()
+    assert bool(seen) == given
+    assert ("0 % looking for the board with the fixed camera" in shown) == (terminal and not given)
+    assert not shown or (shown.endswith("\r\x1b[K") and "\n" not in shown)

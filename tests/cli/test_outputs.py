@@ -1,11 +1,13 @@
 """Earlier results that commands keep, progress on stderr, and numbers in JSON."""
 
+import itertools
 import json
 import math
 import os
 import pty
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -162,6 +164,22 @@ def test_progress_without_a_terminal_is_an_occasional_line(capsys):
         for done in range(4):
             progress(done, 8, f"board {done}")
     assert capsys.readouterr().err.splitlines() == ["board 1 (12 %, 31 s)", "board 3 (38 %, 62 s)"]
+
+
+def test_a_long_step_repeats_its_line_of_progress(monkeypatch):
+    """A fit may take minutes and report nothing meanwhile."""
+    lines, repeated, time = [], threading.Event(), itertools.count(0.0, 20.0)
+    monkeypatch.setattr("cotarget.cli.common.REPEAT_S", 0.001)
+    monkeypatch.setattr(
+        "cotarget.cli.common.print",
+        lambda text, **_: lines.append(text) or (len(lines) > 2 and repeated.set()),
+        raising=False,
+    )
+    with progress_bar(lambda: next(time)) as progress:
+        progress(1, 4, "fitting")
+        assert repeated.wait(60.0)
+    assert lines[:3] == ["fitting (25 %, 40 s)", "fitting (25 %, 80 s)", "fitting (25 %, 120 s)"]
+    assert "progress" not in {thread.name for thread in threading.enumerate()}
 
 
 SHOWING = """

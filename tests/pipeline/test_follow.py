@@ -67,6 +67,9 @@ def test_states_from_searching_to_lost_and_back():
     assert len({step.target.id for step in steps if step.state is State.FOLLOWING}) == 2
     for step in steps:
         assert (step.aim is None) == (step.state is State.SEARCHING)
+        assert str(step).startswith(f"{step.t:.2f} s: {step.state}")
+        assert str(step).endswith("" if step.aim is None else f": {step.aim}")
+        assert "array" not in str(step)
         if step.state is State.LOST:
             assert step.reason.startswith("out of sight for 0.")
             assert "s; looked for where it should be" in step.reason

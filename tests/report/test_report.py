@@ -283,6 +283,8 @@ def test_advice_names_an_uncalibrated_focal_range(plain):
         changed = replace(plain, provenance={"focal_range_px": [667.0, factor * longest]})
         said = advice(changed, replace(UNKNOWN, evidence=gather(changed)))
         assert any("but was calibrated to 667 px" in item for item in said) == named
+        remedies = [judge(bare(changed)).text, *said]
+        assert sum("show a larger board farther away" in text for text in remedies) == 2 * named
 
 
 def test_wavy_board_is_noticed(plain):
