@@ -1,14 +1,13 @@
-"""Fill configuration.md and cli.md from the code when the documentation is built, so that neither gets out of date.
+"""Make the tables of configuration.md and cli.md from the code.
 
-MkDocs runs this as a hook (see mkdocs.yml): both pages hold an introduction and a mark, which is replaced by what is
-made here. `python docs/make_reference.py` prints it.
+Both pages hold an introduction and a mark; `python docs/make_reference.py` writes anew what is below it. A test checks
+that both pages are as the code is.
 """
 
 import argparse
 import dataclasses
 import inspect
 import json
-import logging
 import re
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,10 +33,11 @@ UNITS = {"deg_s2": "degrees/s^2", "deg_s": "degrees/s", "deg": "degrees", "px": 
 UNIT_IN_TEXT = re.compile(r" \[(m|s|px|mm|degrees|degrees/s|degrees/s\^2|grey levels)\]")
 
 
-def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Insert what is made from the code; MkDocs calls this for every page."""
-    make = {"configuration.md": configuration, "cli.md": command_line}.get(page.file.src_uri)
-    return markdown.replace(MARK, make()) if make else markdown
+def pages() -> dict[Path, str]:
+    """Make the text of both pages: the introduction as it is, and below the mark what is made from the code."""
+    made = {"configuration.md": configuration(), "cli.md": command_line()}
+    texts = {Path(__file__).with_name(name): text for name, text in made.items()}
+    return {page: f"{page.read_text('utf-8').partition(MARK)[0]}{MARK}\n\n{text}" for page, text in texts.items()}
 
 
 def configuration() -> str:
@@ -49,7 +49,7 @@ def configuration() -> str:
 
 def _hardware() -> Iterator[str]:
     """Describe the tables of [hardware], one a driver, and the board's."""
-    yield "## `[hardware]` { #hardware }\n"
+    yield _heading("`[hardware]`", "hardware")
     yield (
         "The real devices. The key `driver` of a device's table names its driver, and the driver says which other keys "
         'there are. A driver of your own is `"module:class"`, see [Drivers](drivers.md).\n'
@@ -76,8 +76,8 @@ def _tables(where: str, cls: type[Any], driver: str = "") -> Iterator[str]:
             continue
         default = field.default_factory() if callable(field.default_factory) else field.default
         meaning = meanings.get(field.name, "")
-        if not meaning:  # a warning, and `mkdocs build --strict` fails
-            logging.getLogger("mkdocs.hooks").warning("%s: 'Attributes:' has no %s", cls.__name__, field.name)
+        if not meaning:
+            raise ValueError(f"{cls.__name__}: 'Attributes:' has no {field.name}")
         by_suffix = [unit for end, unit in UNITS.items() if field.name.endswith(f"_{end}")]
         unit, meaning = (UNIT_IN_TEXT.findall(meaning) or by_suffix or [""])[0], UNIT_IN_TEXT.sub("", meaning)
         rows.append((f"`{field.name}`", _kind(hint), unit, _toml(default), _range(key, hint, default, driver), meaning))
@@ -89,7 +89,7 @@ def _tables(where: str, cls: type[Any], driver: str = "") -> Iterator[str]:
         title += "" if len(names) == 1 else f" with driver `{driver}`"
         choices = f'{", ".join(json.dumps(name) for name in names)} or `"module:class"`'
         rows.insert(0, ("`driver`", "string", "", f"`{json.dumps(first)}`", choices, f"the driver; here `{driver}`"))
-    yield f"## {title} {{ #{anchor} }}\n"
+    yield _heading(title, anchor)
     yield (cls.__doc__ or "").partition("Attributes:")[0].replace("\n    ", "\n").strip() + "\n"
     yield _grid(("key", "type", "unit", "default", "range", "meaning"), rows) if rows else ""
     for key, held in inner:
@@ -161,7 +161,7 @@ def command_line() -> str:
     parts = []
     for name, parser in commands.items():
         parser.formatter_class = partial(argparse.HelpFormatter, width=96)
-        parts += [f"## cotarget {name} {{ #{name} }}\n", f"{parser.description[:1].upper()}{parser.description[1:]}.\n"]
+        parts += [_heading(f"cotarget {name}", name), f"{parser.description[:1].upper()}{parser.description[1:]}.\n"]
         parts.append(f"```text\n{parser.format_usage()}```\n".replace("usage: ", "").replace("\n       ", "\n"))
         write = parser._get_formatter()._format_action_invocation
         rows = [(f"`{write(a)}`", a.help or "") for a in parser._actions if a.dest not in ("help", "verbose")]
@@ -171,6 +171,11 @@ def command_line() -> str:
     return "\n".join(parts)
 
 
+def _heading(title: str, anchor: str) -> str:
+    """Write a heading with an anchor that GitHub knows too."""
+    return f'<a id="{anchor}"></a>\n\n## {title}\n'
+
+
 def _grid(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     """Write a table in Markdown."""
     lines = [heads, ("---",) * len(heads), *([cell.replace("|", "\\|") for cell in row] for row in rows)]
@@ -178,4 +183,5 @@ def _grid(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
 
 
 if __name__ == "__main__":
-    print(configuration(), command_line(), sep="\n")  # noqa: T201
+    for page, text in pages().items():
+        page.write_text(text, "utf-8")
