@@ -390,7 +390,8 @@ class TracksByImage:
 
 # Reasons of the steps
 
-NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+)?")
+# A number, or an address or a path, whose numbers are a part of its name.
+NUMBER = re.compile(r"(?P<name>\b[a-z]+:[^\s;]+|(?<!\w)/[^\s;]+)|-?\d+(\.\d+)?(e-?\d+)?")
 ANY = "#"  # in place of a number
 EITHER = re.compile(rf"(\w[^;]*{ANY}) or \1")  # one and two solutions count as one reason
 # Prefixes of reasons that every good run has for a moment: the lens waits, or the target is hidden or not yet there.
@@ -410,6 +411,10 @@ IN_WORDS = {
 }
 
 
+def _without_numbers(reason: str) -> str:
+    return EITHER.sub(r"\1", NUMBER.sub(lambda found: found["name"] or ANY, reason))
+
+
 class Reasons:
     """Counts of the reasons in a run's steps, with numbers ignored: 0.5 s and 0.6 s are one reason."""
 
@@ -421,7 +426,7 @@ class Reasons:
 
     def see(self, step: "Step") -> None:
         """Count the reasons of a step."""
-        parts = {EITHER.sub(r"\1", NUMBER.sub(ANY, part)): part for part in step.reason.split("; ") if part}
+        parts = {_without_numbers(part): part for part in step.reason.split("; ") if part}
         self._steps += 1
         self._counts.update(parts.keys())
         if self._later_steps or step.target is not None:

@@ -273,6 +273,15 @@ def test_frequent_reasons_are_reported_in_order(runs, said):
     assert reasons_of(*runs).warning == said
 
 
+@pytest.mark.parametrize(("reason", "counted"), [
+    ("'ptpip:127.0.0.1:4001:4001' is gone for 3.5 s", "'ptpip:127.0.0.1:4001:4001' is gone for # s"),
+    ("/dev/ttyUSB0: no answer within 0.3 s", "/dev/ttyUSB0: no answer within # s"),
+    ("12 px/s of 640x480; zoom: 3/4", "# px/s of #x#"),
+])  # fmt: skip
+def test_addresses_in_reasons_keep_their_numbers(reason, counted):
+    assert counted in reasons_of((1, reason, True)).table
+
+
 def test_reasons_are_counted_without_their_numbers():
     both, one = "needs pan -4.20, tilt 1.06 or pan 173.18, tilt -1.5e-05 degrees", "needs pan 3, tilt 10.6 degrees"
     table = reasons_of((2, "a 1; zoom: unsure", True), (3, "a 2", True), (1, both, True), (2, one, True)).table

@@ -41,6 +41,11 @@ def test_the_picture_has_all_frames_at_their_rate_and_repeats():
 
 
 def test_the_readmes_picture_is_animated_and_small():
+    """Its first frame, which is all that some viewers show, has the box and a dark bird in the close-up's middle."""
     with PIL.Image.open(TEASER) as picture:
         assert picture.n_frames > 50
+        first = np.asarray(picture.convert("RGB"), int)[..., ::-1]
+    fixed, closeup = first[:, :WIDTH_PX], first[:, WIDTH_PX:]
+    assert (np.abs(fixed - BOX_COLOR).max(axis=2) < 60).sum() > 50
+    assert (closeup[75:225, 100:300].max(axis=2) < 80).sum() > 500
     assert TEASER.stat().st_size < LARGEST_KB * 1024
