@@ -687,7 +687,10 @@ class PolledHead:
         deadline = clock.now() + STANDS_S
         while self._loop.snapshot.moving:
             if clock.now() > deadline:
-                raise DeviceError(f"the pan-tilt unit at {self._link.name} goes on turning though it was halted")
+                raise DeviceError(
+                    f"the pan-tilt unit at {self._link.name} goes on turning though it was halted; one that trembles "
+                    "there needs slack in its driver's AxisFacts"
+                )
             self._loop.turn()
 
 
