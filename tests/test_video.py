@@ -258,21 +258,10 @@ def stamped(path, wild):
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize(
-    "wild",
-    [
-        {12: 162.0},
-        {12: 3.0},
-        {12: 162.0, 13: 162.04},
-        {12: 3.04, 13: 3.0},
-        {12: 162.0, 14: 163.0, 20: 100.5},
-        {0: 162.0},
-        {0: 162.0, 1: 162.04},
-        {29: 162.0},
-        {28: 3.0, 29: 3.04},
-        {28: 162.0, 29: 162.04},
-    ],
-)
+@pytest.mark.parametrize("wild", [
+    {12: 162.0}, {12: 3.0}, {12: 162.0, 13: 162.04}, {12: 3.04, 13: 3.0}, {12: 162.0, 14: 163.0, 20: 100.5},
+    {0: 162.0}, {0: 162.0, 1: 162.04}, {29: 162.0}, {28: 3.0, 29: 3.04}, {28: 162.0, 29: 162.04},
+])  # fmt: skip
 def test_wild_time_stamps_are_replaced_and_reported_once(tmp_path, caplog, wild):
     stamped(tmp_path / "a.mkv", wild)
     with Film(tmp_path / "a.mkv") as film:

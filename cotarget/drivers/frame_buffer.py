@@ -151,13 +151,7 @@ class FrameBuffer:
             self._heard_at = self._clock.now()
 
     def put(
-        self,
-        data: bytes | Image,
-        arrived: float,
-        took: float = 0.0,
-        *,
-        t: float | None = None,
-        serial: Hashable = None,
+        self, data: bytes | Image, arrived: float, took: float = 0.0, *, t: float | None = None, serial: Hashable = None
     ) -> bool:
         """Publish a frame, unless its serial, its own time or else its JPEG is that of the last one.
 
