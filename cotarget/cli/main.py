@@ -151,10 +151,7 @@ def _prepare(descriptor: int, name: str) -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors=AS_GIVEN)
         return
-    nothing = os.open(os.devnull, os.O_RDWR)
-    if nothing != descriptor:
-        os.dup2(nothing, descriptor)
-        os.close(nothing)
+    _open_nothing(descriptor)
     setattr(sys, name, ClosedStdout() if name == "stdout" else os.fdopen(descriptor, "w", closefd=False))
 
 
@@ -163,10 +160,15 @@ def _drop_unwritten(stream: IO[str]) -> None:
     try:
         stream.flush()
     except OSError:
-        with contextlib.suppress(OSError):
-            nothing = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nothing, stream.fileno())
-            os.close(nothing)
+        with contextlib.suppress(OSError):  # without a descriptor there is nothing that Python flushes
+            _open_nothing(stream.fileno())
+
+
+def _open_nothing(descriptor: int) -> None:
+    nothing = os.open(os.devnull, os.O_RDWR)
+    if nothing != descriptor:
+        os.dup2(nothing, descriptor)
+        os.close(nothing)
 
 
 class StderrHandler(logging.Handler):

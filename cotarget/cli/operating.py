@@ -72,9 +72,8 @@ def aim_command(options: argparse.Namespace) -> None:
     # The error budget holds for the exact inverse; the shortcut's additional error is not modelled.
     budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
     is_calibrated = _check_focal_length(calibration, found, pitch_mm)
-    is_plausible = _check_depth(
-        options, calibration, found, config.targets if target is None else {options.target: target}
-    )
+    targets = config.targets if target is None else {options.target: target}
+    is_plausible = _check_depth(options, calibration, found, targets)
     if wanted is not None and found.limited:
         _check_shown_size(calibration, found, wanted, options.target)
     print_json(
@@ -122,9 +121,7 @@ def _check_depth(
         (target.size * (fy / height if target.is_vertical() else fx / width), name) for name, target in targets.items()
     )
     if found.depth < nearest:
-        _warn(
-            f"the {name} fits into the fixed view only from {nearest:.2g} m on: is a depth of {found.depth:g} m meant?"
-        )
+        _warn(f"the {name} fits into the fixed view only from {nearest:.2g} m on; is {found.depth:g} m meant?")
         return False
     largest_px, name = max((fx * target.size / found.depth, name) for name, target in targets.items())
     if largest_px >= LEAST_SEEN_PX:
@@ -368,7 +365,7 @@ def stop_command(options: argparse.Namespace) -> None:
 
     path = find_stop_file(options.rig)
     # A reason that is no text must not keep the stop from being written.
-    write_stop_file(path, os.fsencode(options.reason).decode(errors="replace"))
+    write_stop_file(path, options.reason.encode(errors="surrogateescape").decode(errors="replace"))
     print(f"stopped: no head that watches {path} moves until cotarget clear")
 
 
