@@ -19,7 +19,7 @@ from cotarget.cli.common import (
     print_json,
     rig_files,
 )
-from cotarget.errors import CalibrationError, ConfigError
+from cotarget.errors import CalibrationError, ConfigError, DeviceError
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
@@ -313,7 +313,7 @@ def point_command(options: argparse.Namespace) -> None:
     """Run `cotarget point`: move head and lens, and write a picture of each camera on request."""
     from cotarget.backends import load_config
     from cotarget.calibration.captures import write_image
-    from cotarget.calibration.recorder import wait_for_lens
+    from cotarget.calibration.recorder import wait_for_head, wait_for_lens
     from cotarget.rig import refuse_outside
     from cotarget.safety.stop_file import refuse_if_stopped
 
@@ -342,7 +342,12 @@ def point_command(options: argparse.Namespace) -> None:
             rig.zoom.zoom(options.focal_mm / rig.spec.zoom.pitch_mm)
         if moves:  # an axis that is not asked for is sent to where it stands
             pan, tilt = (getattr(now, axis) if angle is None else math.radians(angle) for axis, angle in asked.items())
-            rig.head.move(pan, tilt, wait=True)
+            goal = rig.head.move(pan, tilt, wait=True)
+            if not wait_for_head(rig, goal, max(abs(goal[0] - now.pan), abs(goal[1] - now.tilt)))[1]:
+                raise DeviceError(
+                    "the head does not stand where it was sent: see that nothing is in its way and that its driver "
+                    "reports where it is"
+                )
         wait_for_lens(rig)
         head, lens = rig.head.state(), rig.zoom.state()
         for name, path in shots.items():

@@ -137,7 +137,10 @@ class SafeCamera:
         return frame
 
     def _accept(self, frame: Frame, now: float) -> None:
-        """Refuse a frame from the future; one newer than all before is a sign of life at ``now`` [s]."""
+        """Refuse a frame from the future; one newer than all before is a sign of life at ``now`` [s].
+
+        A frame that its camera in real time repeats is none. A replay halts where its recording did.
+        """
         ahead = frame.t - now
         if not ahead <= FUTURE_S:
             raise StaleFrameError(
@@ -146,7 +149,8 @@ class SafeCamera:
         self._watchdog.on_call()
         if frame.t > self._newest:
             self._newest = frame.t
-            self._watchdog.alive(now)
+            if not (frame.repeated and self._watchdog.threaded):
+                self._watchdog.alive(now)
 
     def _read(self, newer_than: float | None, timeout: float) -> Frame:
         """Read a frame; without a watchdog thread, interrupt the wait where the watchdog is due."""
@@ -347,7 +351,7 @@ class _Guard:
 
     def begin(self) -> None:
         """Watch a rig in real time, and halt the head of any rig at the program's exit."""
-        atexit.register(self.close)  # for a rig that the program does not close
+        atexit.register(self._close_at_exit)  # for a rig that the program does not close
         if self._rig.spec.real_time:
             self._undo_signals = guard_head(self.watchdog)
             self._watcher = Watcher(self.watchdog)
@@ -376,6 +380,13 @@ class _Guard:
             self._close(deliver=isinstance(error, Exception))  # after Ctrl-C a second one adds nothing
         except Exception as failure:
             self._report(failure, error)
+
+    def _close_at_exit(self) -> None:
+        """Halt the head, then close the rig, where Python would print an exception and ignore it."""
+        try:
+            self._close(deliver=False)
+        except Exception as failure:
+            self._report(failure)
 
     def _report(self, failure: BaseException, error: BaseException | None = None) -> None:
         """Log why the rig could not be closed, unless that is logged already or is the error that led here."""
@@ -420,4 +431,4 @@ class _Guard:
             self._watcher.close()
             self.watchdog.close()
         self._undo_signals()
-        atexit.unregister(self.close)
+        atexit.unregister(self._close_at_exit)

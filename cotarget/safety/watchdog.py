@@ -111,6 +111,7 @@ class Watchdog:
             interrupted = self._halts != motion.halts
             self._alive_at = self._clock.now()
             if self._motion is motion and not interrupted:
+                self._is_inside = arrived or self._is_inside  # a goal lies within the soft limits
                 self._motion = None if arrived else replace(motion, patience_s=0.0, on_its_way=False)
         if interrupted:
             self._halt()  # the command may have reached the unit after the halt

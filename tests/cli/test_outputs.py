@@ -21,7 +21,7 @@ from cotarget.cli.common import previous_kept, print_json, progress_bar
 from cotarget.config import RigConfig
 from cotarget.errors import CalibrationError, DeviceError
 from cotarget.files import write_atomically
-from cotarget.rig import Frame, ZoomState
+from cotarget.rig import Frame, PanTiltState, ZoomState
 from tests.support.commands import OLD, call, refused, true_calibration
 from tests.support.rigs import rig_of
 from tests.support.safety_rigs import SimulatedDevices
@@ -309,6 +309,12 @@ def test_point_moves_no_axis_that_is_not_asked_for(pointed, capsys, folder, want
         said = json.loads(call(capsys, "point", "--rig", "rig.toml", *wanted)[1])
         assert [said["pan_deg"], said["tilt_deg"]] == pytest.approx(moved or [100, 0], abs=step)
     assert bool([what for what, _ in pointed.head.log if what == "move"]) == (moved is not None)
+
+
+def test_point_fails_where_the_head_did_not_arrive(pointed, capsys):
+    """Its driver returns from a move that it waited for, and the head stands elsewhere."""
+    pointed.head.state = lambda: PanTiltState(0.1, 0.0, moving=False, t=pointed.clock.now())
+    assert "does not stand where it was sent" in refused(capsys, "point", "--rig", "rig.toml", "--pan-deg", "-30")
 
 
 def test_point_keeps_earlier_pictures(pointed, capsys, folder):

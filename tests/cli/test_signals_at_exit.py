@@ -282,6 +282,14 @@ def test_unclosed_rig_is_halted_at_exit(start):
     assert (returned, lines, err) == (0, ["halting", "halted", "closed"], "")
 
 
+def test_ctrl_c_while_an_unclosed_rig_is_halted_at_exit_prints_no_traceback(start):
+    child = start(PROGRAM + "safe = guarded(rig, SafetyConfig(watchdog_s=1000.0))\nsafe.head.move(0.5, 0.0)")
+    child.wait_for("halting")
+    child.signal(signal.SIGINT)
+    _, lines, err = child.finish()
+    assert (lines, err) == (["halting", "halted", "closed"], "")
+
+
 def test_program_keeps_its_own_signal_handlers(start):
     own = "import signal\nsignal.signal(signal.SIGTERM, lambda *_: say('mine'))\n"
     child = start(PROGRAM + own + WORK.replace("sleep(1000)", "sleep(0)"))

@@ -149,8 +149,9 @@ def test_a_state_from_before_the_command_does_not_end_its_watch(rig, safe):
     assert rig.head.halts == [pytest.approx(1.0 + WATCHDOG_S, abs=EXACT)]
 
 
+@pytest.mark.parametrize("by_wait", [False, True])
 @pytest.mark.parametrize("outside", [(1.2, 0.0), (0.0, -0.6)])
-def test_a_head_that_leaves_its_soft_limits_is_stopped(rig, outside, caplog):
+def test_a_head_that_leaves_its_soft_limits_is_stopped(rig, outside, by_wait, caplog):
     limits = SafetyConfig(pan_deg=(-60.0, 60.0), tilt_deg=(-30.0, 30.0))
     pose = outside
     rig.head.state = lambda: PanTiltState(*pose, moving=False, t=rig.clock.now())
@@ -159,7 +160,10 @@ def test_a_head_that_leaves_its_soft_limits_is_stopped(rig, outside, caplog):
         assert "stands beyond its soft limits" in caplog.text
         safe.head.move(0.0, 0.0)
         pose = (0.0, 0.0)
-        safe.head.state()
+        if by_wait:  # a move that has arrived shows that the head is inside
+            safe.head.move(0.0, 0.0, wait=True)
+        else:
+            safe.head.state()
         assert not rig.head.halts
         pose = outside
         safe.head.state()
@@ -269,6 +273,18 @@ def test_the_head_of_a_hung_program_is_halted(where, caplog):
     print(f"{where}: halted {late * 1000:.1f} ms after the watchdog's time")
     assert -0.01 < late < TIMELY_S
     assert warnings(caplog)[0].startswith("halting the head: neither")
+
+
+@pytest.mark.wire
+def test_frames_that_a_camera_repeats_are_no_sign_of_life(real):
+    """They have new times, as of a stream whose encoder stands."""
+    rig, safe = real
+    rig.fixed.read = lambda *a: Frame(IMAGE, rig.clock.now(), repeated=True)
+    safe.head.move(1.0, 0.0)
+    deadline = time.monotonic() + DEADLINE_S
+    while not rig.head.halted.is_set():
+        safe.fixed.read()
+        assert time.monotonic() < deadline
 
 
 @pytest.mark.wire
