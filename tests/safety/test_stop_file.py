@@ -51,15 +51,16 @@ def test_a_change_of_the_working_directory_changes_neither_stop_file_nor_marker(
     config = load_config("roof.toml")
     made = SafetyConfig(stop_file=Path("made.stop"))
     lost = PositionLostMarker("/dev/pts/7", made.stop_file)
-    with guarded(SimulatedDevices(), config.safety) as read, guarded(SimulatedDevices(), made) as by_hand:
+    with guarded(SimulatedDevices(), made) as by_hand:
         monkeypatch.chdir("elsewhere")
         lost.note("it stalled")
         assert (tmp_path / "made.stop.dev-pts-7.position-lost").exists()
-        for rig, name in ((read, "roof.stop"), (by_hand, "made.stop")):
-            (tmp_path / name).write_text("on the roof")
-            assert rig.stopped == "on the roof"
-            with pytest.raises(EmergencyStopError):
-                rig.head.move(0.1, 0.0)
+        with guarded(SimulatedDevices(), config.safety) as read:  # opened elsewhere than the file was read
+            for rig, name in ((read, "roof.stop"), (by_hand, "made.stop")):
+                (tmp_path / name).write_text("on the roof")
+                assert rig.stopped == "on the roof"
+                with pytest.raises(EmergencyStopError):
+                    rig.head.move(0.1, 0.0)
 
 
 def test_an_incomplete_stop_file_line_is_refused(tmp_path):
