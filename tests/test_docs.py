@@ -55,9 +55,9 @@ def test_the_experiment_that_the_documentation_adds_runs(monkeypatch):
     assert experiment.missed(experiment.summarise(rows)) == []
 
 
+@pytest.mark.docs  # it needs the packages of the docs build
 def test_reference_is_as_the_code_is_and_lists_options_keys_and_the_end_of_help():
     """`python docs/make_reference.py` writes both pages anew; versions of Python break usage lines differently."""
-    pytest.importorskip("griffe", reason="it needs the packages of the docs build")
     pages = runpy.run_path(str(ROOT / "docs/make_reference.py"))["pages"]()
     keys, commands = pages.values()
     for page, text in pages.items():
