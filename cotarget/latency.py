@@ -1,17 +1,17 @@
 """Measure the latencies of cameras, head and lens from recorded motion.
 
 - Zoom camera against the head's reports: the head wiggles, and its angle and the image's shift show the same motion.
+  The shift is the median of tracked corners (Lucas and Kanade), so something small may move in the image.
 - Fixed camera against the zoom camera: a board swings in front of both.
 - Head against its commands: from a command to the start of the acceleration that follows.
-- Lens against its commands: the lens zooms in and out; tracked corners (Lucas and Kanade) and a similarity through them
-  give the scale from frame to frame, and the first part of each way, extrapolated back, gives the start.
+- Lens against its commands: the lens zooms in and out; a similarity through tracked corners gives the scale from frame
+  to frame, and the first part of each way, extrapolated back, gives the start.
 
 Two records of one motion are matched by the delay at which one is best explained by the other times a factor, plus a
 constant. The choice of intervals: docs/design-notes.md.
 """
 
 import itertools
-import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -31,7 +31,6 @@ from cotarget.geometry import Array, RigidTransform, pose
 from cotarget.rig import Camera, Frame, Image, PanTiltState, Rig, refuse_outside
 from cotarget.targeting import aim
 
-log = logging.getLogger(__name__)
 GROWTH = 2.0  # zoom factor of a measurement, or the lens's whole range; less than LEAST_GROWTH measures nothing
 LEAST_GROWTH = 1.1
 WAYS = 6  # number of ways, in and out alternately
@@ -196,8 +195,6 @@ LONGEST_DELAY = 0.6  # largest delay searched, of either sign [s]
 COARSE = 0.01  # step of the coarse search [s]
 FEWEST = 20  # fewest samples of a motion
 AGREEMENT = 0.9  # least correlation of two records
-ASIDE = np.radians(1.0)  # farther from straight ahead than this, the head measures there where it sees no motion [rad]
-BANDS = 3  # horizontal parts of the image that are compared one by one where the whole does not move
 EARLY = 0.4  # part of a turn's way in which the head still accelerates
 # Largest ratio of true and stated acceleration; from here on, the start of a turn is wrong by more than some 10 ms.
 MISFIT = 1.5
@@ -234,8 +231,7 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     """Measure the latencies of zoom camera and head by wiggling the head.
 
     Args:
-        rig: the rig; its lens goes to the shortest focal length, and its head back to where it was; or straight
-            ahead, where the image showed no motion there.
+        rig: the rig; its lens goes to the shortest focal length, and its head back to where it was.
         seconds: duration [s].
 
     Raises:
@@ -247,25 +243,16 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     home = rig.head.state()
     refuse_outside(home, rig.head.limits)
     _zoom_out(rig)
-    try:
-        return _wiggle(rig, (home.pan, home.tilt), seconds)
-    except CalibrationError as error:
-        if max(abs(home.pan), abs(home.tilt)) <= ASIDE:
-            raise
-        log.warning("%s; the head measures straight ahead", error)
-    return _wiggle(rig, rig.head.move(0.0, 0.0, wait=True), seconds)
-
-
-def _wiggle(rig: Rig, home: tuple[float, float], seconds: float) -> HeadLatency:
-    """Wiggle the head about a pan and tilt [rad] for some seconds, and compare its reports with the image's shift."""
-    pan, tilt = home
+    pan, tilt = home.pan, home.tilt
     low, high = rig.head.limits.pan
     way = WIGGLE if pan + WIGGLE <= high else -WIGGLE
-    frames: list[Frame] = []
+    times: list[float] = []
+    shifts: list[float] = []
     states: list[PanTiltState] = []
     starts: list[tuple[float, float, float]] = []
     side = itertools.cycle((1.0, 0.0))
     pauses = itertools.cycle(TURNS_EVERY)
+    shift = HorizontalShift()
     end = rig.clock.now() + seconds
     while rig.clock.now() < end:
         goal = min(max(pan + way * next(side), low), high)
@@ -273,15 +260,16 @@ def _wiggle(rig: Rig, home: tuple[float, float], seconds: float) -> HeadLatency:
         t = rig.clock.now()
         goal, _ = rig.head.move(goal, tilt)
         starts.append((t, before, goal))
-        for frame in _frames(rig, rig.zoom, t + next(pauses), frames[-1].t if frames else None, states):
-            frames.append(frame)
+        for frame in _frames(rig, rig.zoom, t + next(pauses), times[-1] if times else None, states):
+            times.append(frame.t)
+            shifts.append(shift.of(frame.image))
     rig.head.move(pan, tilt, wait=True)
-    times, pans = np.array([(state.t, state.pan) for state in states]).T
-    late = lateness([frame.t for frame in frames], rig.spec.zoom.rate_hz, times)
-    if len(frames) < FEWEST:
-        few = f"the zoom camera gave {len(frames)} frames in {seconds:g} s; {FEWEST} are needed"
+    reported, pans = np.array([(state.t, state.pan) for state in states]).T
+    late = lateness(times, rig.spec.zoom.rate_hz, reported)
+    if len(times) < FEWEST:
+        few = f"the zoom camera gave {len(times)} frames in {seconds:g} s; {FEWEST} are needed"
         raise StaleFrameError("; ".join(filter(None, (few, late))))
-    zoom = _zoom_delay(frames, times, pans)
+    zoom = delay_between(np.array(times), np.array(shifts), reported, pans)
     if zoom.agreement < AGREEMENT:
         unmoved = (
             f"the zoom camera's picture at pan {np.degrees(pan):z.1f}, tilt {np.degrees(tilt):z.1f} degrees does not "
@@ -293,23 +281,7 @@ def _wiggle(rig: Rig, home: tuple[float, float], seconds: float) -> HeadLatency:
         command = command_delay(starts, states, rig.head.limits.acceleration)
     except CalibrationError as error:
         raise CalibrationError(late or str(error)) from None
-    return HeadLatency(zoom, command, len(frames), late)
-
-
-def _zoom_delay(frames: Sequence[Frame], times: Array, pans: Array) -> Delay:
-    """Find the delay of the zoom camera's frames from the shift of the image, or of the third of it that agrees best.
-
-    Above the horizon the sky does not show the motion; a third of the image may show it all the same.
-    """
-    t = np.array([frame.t for frame in frames])
-    images = [frame.image for frame in frames]
-    whole = delay_between(t, horizontal_shifts(images), times, pans)
-    if whole.agreement >= AGREEMENT:
-        return whole
-    edges = np.linspace(0, images[0].shape[0], BANDS + 1).astype(int)
-    bands = [[image[top:bottom] for image in images] for top, bottom in itertools.pairwise(edges)]
-    delays = [delay_between(t, horizontal_shifts(band), times, pans) for band in bands]
-    return max(whole, *delays, key=lambda delay: delay.agreement)
+    return HeadLatency(zoom, command, len(times), late)
 
 
 def measure_fixed(
@@ -395,11 +367,23 @@ def delay_between(t: Array, values: Array, t_other: Array, other: Array) -> Dela
     return Delay(float(found.x), float(np.sqrt(1.0 - found.fun)))
 
 
-def horizontal_shifts(images: Sequence[Image]) -> Array:
-    """Horizontal shift of each image against the first one, by phase correlation [px], (n,)."""
-    greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32) for image in images]
-    window = cv2.createHanningWindow(greys[0].shape[::-1], cv2.CV_32F)
-    return np.array([cv2.phaseCorrelate(greys[0], grey, window)[0][0] for grey in greys])
+class HorizontalShift:
+    """Horizontal shift of images against the first one: the median of the corners that are tracked from it."""
+
+    def __init__(self) -> None:
+        self._first: Image | None = None
+        self._corners: Array | None = None
+
+    def of(self, image: Image) -> float:
+        """Measure an image's shift [px]; 0 if it or the first one shows too few corners."""
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if self._first is None:
+            self._first, self._corners = grey, cv2.goodFeaturesToTrack(grey, CORNERS, WEAKEST, APART_PX)
+        if self._corners is None:
+            return 0.0
+        moved, seen, _ = cv2.calcOpticalFlowPyrLK(self._first, grey, self._corners, None)
+        ways = (moved - self._corners)[seen.ravel() > 0, 0, 0]
+        return float(np.median(ways)) if len(ways) >= FEWEST_CORNERS else 0.0
 
 
 def command_delay(
