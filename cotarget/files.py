@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from cotarget.errors import ConfigError, CotargetError
@@ -173,7 +172,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 STDOUT = Path("-")  # name of stdout as the file of a table
 
 
-class CsvFile:
+class CsvFile(contextlib.AbstractContextManager["CsvFile", None]):
     """Write a table as csv, under its name only when it is complete; `STDOUT` gets each row at once. A context manager.
 
     Each row is on the disk before the next one, so that the temporary file of a killed run holds all rows.
@@ -227,13 +226,7 @@ class CsvFile:
             self._file.truncate(begin)
             raise write_error(self._path, error) from None
 
-    def __enter__(self) -> "CsvFile":
-        """Return the table itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Complete the file and give it its name; after an error, remove it or keep the rows so far.
 
         Raises:

@@ -7,8 +7,8 @@ advances the rig's own clock, which is simulated time in the simulation.
 import json
 import math
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -290,7 +290,7 @@ class Guard(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Rig:
+class Rig(AbstractContextManager["Rig", None]):
     """Two cameras, a head, a clock and a board. A context manager that halts, then closes.
 
     A rig with other devices is made by `dataclasses.replace`; closing either closes both.
@@ -349,13 +349,7 @@ class Rig:
         """
         self.release()
 
-    def __enter__(self) -> "Rig":
-        """Return the rig itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Halt, then close."""
         if self.guard is None or error is None:
             self.release()

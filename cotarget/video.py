@@ -10,7 +10,6 @@ from dataclasses import replace
 from datetime import datetime, timedelta
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import cast
 
 import av
@@ -145,7 +144,7 @@ def _quarter_turns(path: Path) -> int:
     return 0
 
 
-class Film:
+class Film(contextlib.AbstractContextManager["Film", None]):
     """Read a film: iterate over it for its frames. A context manager.
 
     Frames that cannot be decoded are left out, and `shortfall` says so, as it does where a film ends before the time in
@@ -197,13 +196,7 @@ class Film:
         self._slots = 0  # end of what was read, in frames of the stream's own time
         self._end = 0.0  # end of what was read of pictures and sound, in the film's time [s]
 
-    def __enter__(self) -> "Film":
-        """Return the film itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file."""
         self._container.close()
 
@@ -330,7 +323,7 @@ FRAGMENTS = {"movflags": "hybrid_fragmented+delay_moov", "frag_duration": "10000
 KEYFRAME_S = 1.0  # a piece begins with a keyframe
 
 
-class FilmWriter:
+class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
     """Write a film as H.264 yuv420p, under its name only when it is complete. A context manager.
 
     Frames are shown at their own times. What a killed run has written so far can be played from its temporary file.
@@ -413,13 +406,7 @@ class FilmWriter:
     def _said(self, error: Exception) -> CotargetError:
         return CotargetError(f"{self._path}: cannot be written ({reason_of(error)}); name e.g. an .mp4")
 
-    def __enter__(self) -> "FilmWriter":
-        """Return the writer itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Complete the film and give it its name; after an error, remove it or keep the frames so far.
 
         Raises:

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
@@ -283,7 +282,7 @@ def step_row(step: Step, epoch: datetime | None = None) -> list[object]:
     return [cell + 0.0 if isinstance(cell, float) else cell for cell in row]  # no -0.0
 
 
-class Recorder:
+class Recorder(contextlib.AbstractContextManager["Recorder", None]):
     """Record a run into a folder that `cotarget.recording.replay` can open as a rig; a context manager.
 
     Wrap the rig below the safety layer, and close it before the recorder:
@@ -365,13 +364,7 @@ class Recorder:
             rig.close()
             raise
 
-    def __enter__(self) -> "Recorder":
-        """Return the recorder itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         """Write the rest of the queue and how the run ended; remove the recording if no rig was wrapped.
 
         Raises:
