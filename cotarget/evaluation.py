@@ -192,7 +192,7 @@ class TruthFinder:
         inside = (at >= 0).all() and (at <= np.array(frame.image.shape[1::-1]) - 1).all()
         if not inside or off @ np.linalg.solve(view.covariance, off) > GATE:
             return None
-        return ZoomMeasurement(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), 1.0, 1.0, np.ptp(box, axis=0), frame.t)
+        return ZoomMeasurement(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), frame.t)
 
 
 # Depths of the targets for which pointing errors are stated, over the whole fixed image [m].

@@ -96,9 +96,7 @@ class Aim:
         return float(self.x_fixed[2])
 
 
-def depth_of(
-    calibration: Calibration, target: TargetProfile, size_px: float, center_px: Array, *, upright: bool = False
-) -> float:
+def depth_of(calibration: Calibration, target: TargetProfile, size_px: float, center_px: Array) -> float:
     """Estimate a target's depth from its apparent size: z = f x_size / u_measured.
 
     Args:
@@ -106,12 +104,9 @@ def depth_of(
         target: target profile, with its size and which dimension that is.
         size_px: measured dimension in the fixed image [px].
         center_px: centre of the target in the fixed image, (2,) [px].
-        upright: for a wingspan, whether the larger side of the box is its height.
     """
-    vertical = target.is_vertical(height=2.0 if upright else 1.0)
-    return depth_from_size(
-        calibration.fixed.lens, target.size, size_px, np.asarray(center_px, float), vertical=vertical
-    )
+    lens, center = calibration.fixed.lens, np.asarray(center_px, float)
+    return depth_from_size(lens, target.size, size_px, center, vertical=target.is_vertical())
 
 
 # Sizes of targets [m]. Beyond them another unit was meant: a beetle has 5 mm, the largest aircraft 84 m. A person's

@@ -29,12 +29,10 @@ class Drive:
 
     Attributes:
         aim: aim at where the target will be when a command given now takes effect.
-        chance: probability that the whole target is in the next zoom frame.
-        zoom_reason: reason for the focal length, see `cotarget.control.zoom.ZoomChoice`.
+        zoom_reason: reason for the focal length, see `cotarget.control.zoom.ZoomController.choose`.
     """
 
     aim: Aim
-    chance: float
     zoom_reason: str
 
 
@@ -103,19 +101,19 @@ class Controller:
         exposed = interval + (now + self._rig.spec.zoom.delay_s)
         (pan_then, _), (tilt_then, _) = self._head_controller.head.at(exposed)
         then = predict(exposed if self._predict else seen_t)
-        choice = self._zoom.choose(
+        focal_px, reason = self._zoom.choose(
             None if then is None else expect(then, pan_then, tilt_then, focal, shape=shape),
             course.first.focal_px * course.then.range / course.first.range,
             self._true(focal),
             now,
             self._true(self._rig.zoom.state().focal_px),
         )
-        nominal = self._calibration.zoom_head.lens.nominal_for(choice.focal_px)
+        nominal = self._calibration.zoom_head.lens.nominal_for(focal_px)
         if abs(math.log(nominal / focal)) > NO_CHANGE:
             focal = self._rig.zoom.zoom(nominal)
             self.lens_commands += 1
         self.commanded = (pan, tilt, focal)
-        return Drive(course.first, choice.chance, choice.reason)
+        return Drive(course.first, reason)
 
     def search(self, predict: Predict, seen_t: float, interval: float) -> Aim | None:
         """Zoom out, and point the head where a target out of sight should be.

@@ -58,21 +58,6 @@ class ExpectedTarget:
     size_sigma: float = 0.0
 
 
-@dataclass(frozen=True)
-class ZoomChoice:
-    """Decision on the lens.
-
-    Attributes:
-        focal_px: chosen focal length [px].
-        chance: probability that the whole target is then in the image.
-        reason: "wanted", "unsure", "about to be lost", "settling" or "lost".
-    """
-
-    focal_px: float
-    chance: float
-    reason: str
-
-
 def shape_of(track: Track) -> float:
     """Width over height of a track's usual box."""
     width, height = track.size_px.tolist()
@@ -202,7 +187,7 @@ class ZoomController:
         commanded_px: float,
         t: float,
         now_px: float | None = None,
-    ) -> ZoomChoice:
+    ) -> tuple[float, str]:
         """Decide on the focal length.
 
         Args:
@@ -211,16 +196,15 @@ class ZoomController:
             commanded_px: focal length commanded last [px].
             t: time now [s].
             now_px: focal length now [px]; the commanded one by default.
+
+        Returns:
+            The focal length [px], and the reason: "wanted", "unsure", "about to be lost", "settling" or "lost".
         """
         if expected is None:
             self._out_t = t
-            return ZoomChoice(self._range[0], 0.0, "lost")
+            return self._range[0], "lost"
         settings, size = self._settings, self._size
         wanted = min(max(wanted_px, self._range[0]), self._range[1])
-
-        def choice(focal_px: float, reason: str) -> ZoomChoice:
-            return ZoomChoice(focal_px, chance_inside(expected, focal_px, size, settings.rim_px), reason)
-
         sure = longest_focal(expected, settings.sure, size, self._range, settings.rim_px)
         goal = min(wanted, sure)
         reason = "wanted" if wanted <= sure else "unsure"
@@ -229,14 +213,14 @@ class ZoomController:
             if t - self._out_t < settings.settle_s:
                 # The reason to zoom out may have passed before the lens got there: stop where it is enough now.
                 here = commanded_px if now_px is None else now_px
-                return choice(max(commanded_px, min(goal, here)), "settling")
-            return choice(goal, reason)
+                return max(commanded_px, min(goal, here)), "settling"
+            return goal, reason
         if change < 0 and commanded_px > longest_focal(expected, LIKELY, size, self._range, settings.rim_px):
             self._out_t = t
-            return choice(goal, "about to be lost")
+            return goal, "about to be lost"
         if math.log(wanted / commanded_px) < -settings.deadband:
-            return choice(goal, reason)
-        return choice(commanded_px, reason)
+            return goal, reason
+        return commanded_px, reason
 
 
 def _below(value: float, sigma: float) -> float:

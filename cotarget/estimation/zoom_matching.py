@@ -234,14 +234,12 @@ class Place:
         center_px: body's centre in the zoom image (u, v), (2,).
         score: normalised correlation, -1 to 1.
         lead: score less that of the next best place.
-        seen: part of the target inside the zoom image, 0 to 1.
         sigma_px: standard deviation of the place along u and v each [px].
     """
 
     center_px: Array
     score: float
     lead: float
-    seen: float
     sigma_px: float
 
 
@@ -312,7 +310,6 @@ def _search(
         center_px=first_px + step @ (middle + top),
         score=best,
         lead=best - max(float(score.max()), 0.0),
-        seen=float(seen[row, column]),
         sigma_px=settings.sigma_px * (1 + pitch) * view.scale,
     )
 
@@ -344,18 +341,12 @@ class ZoomMeasurement:
         center_px: the centre in the zoom image (u, v), (2,).
         sigma_px: standard deviation against the same point in the fixed image, along u and v each [px].
         body_sigma_px: standard deviation of that point against the body's true centre, along u and v, (2,) [px].
-        score: normalised correlation, 0 to 1.
-        seen: part of the target inside the zoom image, 0 to 1.
-        size_px: width and height of the detection's box at the zoom image's scale, (2,).
         t: exposure time of the zoom frame [s].
     """
 
     center_px: Array
     sigma_px: float
     body_sigma_px: Array
-    score: float
-    seen: float
-    size_px: Array
     t: float
 
 
@@ -440,9 +431,6 @@ class CloseupFinder:
             center_px=place.center_px,
             sigma_px=place.sigma_px,
             body_sigma_px=np.abs(view.J) @ fixed_view.body_sigma_px,
-            score=place.score,
-            seen=place.seen,
-            size_px=np.linalg.norm(view.J, axis=0) * fixed_view.size_px,
             t=frame.t,
         )
 

@@ -261,9 +261,9 @@ class LoneCamera:
         wanted_px = self._target.wanted_px / course.size
         if not course.whole:  # do not zoom in before the whole target was seen
             wanted_px = min(wanted_px, true_px)
-        choice = self._policy.choose(expected, wanted_px, true_px, now, now_px)
-        if abs(choice.focal_px / true_px - 1) > NO_CHANGE:
-            self._focal = rig.zoom.zoom(self._zoom.nominal_for(choice.focal_px))
+        focal_px, _ = self._policy.choose(expected, wanted_px, true_px, now, now_px)
+        if abs(focal_px / true_px - 1) > NO_CHANGE:
+            self._focal = rig.zoom.zoom(self._zoom.nominal_for(focal_px))
 
     def _look_around(self, mode: str, frame_t: float) -> None:
         """At the shortest focal length, go to the next pose once a frame from the current one has shown nothing."""

@@ -51,17 +51,17 @@ def test_wide_while_unsure_close_when_sure_and_out_before_it_is_lost():
     policy = ZoomController(RANGE, SIZE)
     commanded, t, way = RANGE[0], 0.0, []
     for sigma in [0.3] * 10 + list(np.geomspace(0.3, 0.001, 40)) + [0.001] * 20 + list(np.geomspace(0.001, 0.2, 20)):
-        choice = policy.choose(expected(sigma), 4000.0, commanded, t)
-        commanded, t = choice.focal_px, t + FRAME
-        way.append((sigma, commanded, choice))
+        commanded, reason = policy.choose(expected(sigma), 4000.0, commanded, t)
+        t += FRAME
+        way.append((sigma, commanded, reason))
     assert way[9][1] == RANGE[0]
     assert way[69][1] == pytest.approx(4000.0, rel=0.06)
-    assert way[69][2].reason == "wanted"
+    assert way[69][2] == "wanted"
     assert way[-1][1] < 1.1 * RANGE[0]
     # Never closer than the lower chance allows, at any step.
     assert all(c == RANGE[0] or chance_inside(expected(s), c, SIZE) >= 0.79 for s, c, _ in way)
-    assert policy.choose(None, 4000.0, commanded, t).reason == "lost"
-    assert policy.choose(None, 4000.0, 4000.0, t).focal_px == RANGE[0]
+    assert policy.choose(None, 4000.0, commanded, t) == (RANGE[0], "lost")
+    assert policy.choose(None, 4000.0, 4000.0, t) == (RANGE[0], "lost")
 
 
 def test_the_lens_does_not_hunt():
@@ -72,9 +72,9 @@ def test_the_lens_does_not_hunt():
         policy, commanded, count = ZoomController(RANGE, SIZE, settings), RANGE[0], 0
         for i in range(500):
             seen = expected(0.02 * math.exp(rng.normal(0, 0.2)))
-            choice = policy.choose(seen, 4000.0 * math.exp(rng.normal(0, 0.02)), commanded, i * FRAME)
-            count += choice.focal_px != commanded
-            commanded = choice.focal_px
+            focal_px, _ = policy.choose(seen, 4000.0 * math.exp(rng.normal(0, 0.02)), commanded, i * FRAME)
+            count += focal_px != commanded
+            commanded = focal_px
         return count
 
     nervous = moves(ZoomSettings(deadband=0.0, settle_s=0.0))
@@ -84,7 +84,7 @@ def test_the_lens_does_not_hunt():
 def test_a_target_that_comes_near_is_followed_by_zooming_out():
     policy, commanded = ZoomController(RANGE, SIZE), 4000.0
     for i, wanted in enumerate(np.geomspace(4000.0, 1500.0, 50)):
-        commanded = policy.choose(expected(0.002), float(wanted), commanded, i * FRAME).focal_px
+        commanded, _ = policy.choose(expected(0.002), float(wanted), commanded, i * FRAME)
         assert abs(math.log(commanded / wanted)) < 0.1
 
 
@@ -92,14 +92,13 @@ def test_a_target_that_comes_near_is_followed_by_zooming_out():
 def test_after_a_zoom_out_the_lens_zooms_in_only_when_things_have_settled(sigma):
     """A lens on its way out stops where it is once that is sure enough."""
     policy = ZoomController(RANGE, SIZE)
-    out = policy.choose(expected(sigma), 4000.0, 4000.0, 0.0)
-    assert out.reason == "about to be lost"
-    assert policy.choose(expected(0.001), 4000.0, out.focal_px, 0.05).focal_px == out.focal_px
-    stopped = policy.choose(expected(0.001), 4000.0, out.focal_px, 0.1, now_px=3500.0)
-    assert (stopped.focal_px, stopped.reason) == (3500.0, "settling")
+    out, reason = policy.choose(expected(sigma), 4000.0, 4000.0, 0.0)
+    assert reason == "about to be lost"
+    assert policy.choose(expected(0.001), 4000.0, out, 0.05)[0] == out
+    assert policy.choose(expected(0.001), 4000.0, out, 0.1, now_px=3500.0) == (3500.0, "settling")
     # Nor does it go in meanwhile, wherever it is said to be.
-    assert policy.choose(expected(0.001), 4000.0, stopped.focal_px, 0.14, now_px=3000.0).focal_px == 3500.0
-    assert policy.choose(expected(0.001), 4000.0, stopped.focal_px, 0.4).focal_px == 4000.0
+    assert policy.choose(expected(0.001), 4000.0, 3500.0, 0.14, now_px=3000.0)[0] == 3500.0
+    assert policy.choose(expected(0.001), 4000.0, 3500.0, 0.4)[0] == 4000.0
 
 
 def test_an_estimate_says_what_to_expect():

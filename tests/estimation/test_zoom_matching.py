@@ -25,7 +25,6 @@ FINE = 8  # scenes are drawn with this many bits of sub-pixel, and antialiased
 FOCAL, CENTER, DISTORTION = 690.0, (319.5, 239.5), np.array([-0.2, 0.0, 0.0, 0.0])
 BASELINE = 0.4  # [m]
 SIGMA_PX = 20.0  # of the expected place in the zoom image: 2 m of 10 m in depth at 700 px
-OUTLINE_OFF = 0.25  # relative error of an outline's sides: one of 18 px in the fixed image, and blur
 REGISTERED_PX = 0.25  # of the fixed image: a sixtieth of the smallest target below
 BIRD = DEFAULT_TARGETS["bird"]
 # A bird with a wing up, seen from the side, in metres about its middle.
@@ -131,8 +130,6 @@ def test_a_target_is_registered_at_any_focal_length_and_roll(nominal, roll_deg):
     assert error < 4 * found.sigma_px * FOCAL / nominal
     # A wing moves the body's centre, which is no error of the registration.
     assert (found.body_sigma_px > found.sigma_px / 4).all()
-    assert found.seen == pytest.approx(1.0)
-    assert found.size_px == pytest.approx(np.array([0.52, 0.4]) * nominal / 20.0, rel=OUTLINE_OFF)
 
 
 def test_nothing_is_found_in_an_empty_zoom_image():
@@ -165,7 +162,6 @@ def test_a_target_clipped_by_the_zoom_image_is_found_while_most_of_it_shows():
         assert (found is not None) == found_there, off
         if found is not None:
             assert scene.error(found) < 2 * REGISTERED_PX
-            assert (found.seen < 0.98) == (off != 0)
 
 
 def test_a_zoom_stream_of_half_the_size_is_registered():
@@ -279,7 +275,7 @@ def test_rendered_targets_are_registered_from_the_shortest_focal_length_to_the_l
         head, lens = truth.head_at(t), truth.nominal_at(t)
         found = finder.find(zoom, Expected(x_fixed * 1.05, 30.0**2 * np.eye(2), *head, lens))
         assert found is not None, f"at {nominal:.0f} px"
-        scale = float(np.mean(found.size_px / box.size_px))
+        scale = truth.lens("zoom", t).focal_px[0] / truth.lens("fixed", t).focal_px[0]
         error = (found.center_px - truth.pixel("zoom", truth.center(name, t), t)) / scale
         body = fixed_view.body_px - truth.pixel("fixed", truth.center(name, t), t)
         off = float(np.linalg.norm(error - body))

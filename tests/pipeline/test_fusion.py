@@ -172,7 +172,7 @@ class Finder:
         if (center - there) @ np.linalg.solve(expected.covariance, center - there) > self.gate:
             return None
         body_sigma_px = np.full(2, self.body_sigma_px)
-        return ZoomMeasurement(center + self.off_px, 1.0, body_sigma_px, 1.0, 1.0, np.ones(2), frame.t)
+        return ZoomMeasurement(center + self.off_px, 1.0, body_sigma_px, frame.t)
 
 
 def test_two_targets_that_cross_are_predicted_through_their_shared_box():
@@ -458,7 +458,7 @@ class Ahead(CloseupFinder):
 
     def find(self, frame, expected):
         self.asked.append(frame.t)
-        return ZoomMeasurement(np.array(CENTER), 1.0, np.ones(2), 1.0, 1.0, np.ones(2), frame.t)
+        return ZoomMeasurement(np.array(CENTER), 1.0, np.ones(2), frame.t)
 
 
 def apart(by, frames=60, missed=lambda i: 0):

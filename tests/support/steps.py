@@ -24,5 +24,5 @@ def step(t, side=8.0, shared=False, off_px=0.0, focal_px=3000.0, seen_s=0.0):
     frame, head, lens = Frame(PICTURE, t), PanTiltState(0.1, 0.0, False, t), ZoomState(focal_px, False, t)
     told = (0.1, 0.0, 3000.0)
     made = Step(0, t, State.FOLLOWING, "", frame, frame, None, (box,), (track,), track, AIM, told, head, lens)
-    at = ZoomMeasurement(MIDDLE + np.array([off_px, 0.0]), 1.0, np.ones(2), 1.0, 1.0, size, t - seen_s)
+    at = ZoomMeasurement(MIDDLE + np.array([off_px, 0.0]), 1.0, np.ones(2), t - seen_s)
     return dataclasses.replace(made, found=at)
