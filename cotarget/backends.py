@@ -1,6 +1,5 @@
 """Read, check and open the rig that a rig.toml describes; the only module that imports backends."""
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -87,21 +86,8 @@ def open_rig(config: "RigConfig | Path | str", guarded: bool = True, *, file: Pa
     if isinstance(config, str | Path):
         file = Path(config)
         config = load_config(file)
-    rig = _open_locked(config, file)
+    rig = _open_hardware(config, file) if config.backend == "hardware" else OPENERS[config.backend](config)
     return guard(rig, config.safety) if guarded else rig
-
-
-def _open_locked(config: "RigConfig", file: Path | None) -> Rig:
-    """Open a rig; that of real devices has the lock of its rig.toml until it is released."""
-    if config.backend != "hardware" or file is None:
-        return OPENERS[config.backend](config)
-    from cotarget.drivers.interlock import rig_lock
-
-    with contextlib.ExitStack() as opened:
-        opened.enter_context(rig_lock(file=file))
-        rig = OPENERS[config.backend](config)
-        opened.callback(rig.release)
-        return replace(rig, release=opened.pop_all().close)
 
 
 def _open_simulation(config: "RigConfig") -> Rig:
@@ -110,10 +96,10 @@ def _open_simulation(config: "RigConfig") -> Rig:
     return SimWorld(config).rig
 
 
-def _open_hardware(config: "RigConfig") -> Rig:
+def _open_hardware(config: "RigConfig", file: Path | None) -> Rig:
     from cotarget.drivers.rig import open_hardware
 
-    return open_hardware(config)
+    return open_hardware(config, file)
 
 
 def _open_replay(config: "RigConfig") -> Rig:
@@ -122,12 +108,8 @@ def _open_replay(config: "RigConfig") -> Rig:
     return Replay(open_recording(_recording_of(config))).rig
 
 
-# Functions that open a backend's rig without the safety layer.
-OPENERS: dict[str, Callable[["RigConfig"], Rig]] = {
-    "sim": _open_simulation,
-    "hardware": _open_hardware,
-    "replay": _open_replay,
-}
+# Functions that open the rig of a backend without devices, and without the safety layer.
+OPENERS: dict[str, Callable[["RigConfig"], Rig]] = {"sim": _open_simulation, "replay": _open_replay}
 
 
 def open_recording(directory: Path) -> "Recording":

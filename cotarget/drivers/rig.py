@@ -5,6 +5,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass, replace
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -250,10 +251,11 @@ def _spec(found: Mapping[str, Device]) -> RigSpec:
     return RigSpec(**{role: found[role].spec for role in ROLES}, real_time=True)
 
 
-def open_hardware(config: RigConfig) -> Rig:
+def open_hardware(config: RigConfig, file: Path | None = None) -> Rig:
     """Open the devices of a configuration; the head comes last and does not move where another device is missing.
 
-    Shortens the thread switch interval of this process (`SWITCH_INTERVAL`).
+    Shortens the thread switch interval of this process (`SWITCH_INTERVAL`). No second program may open the rig of
+    ``file``, its rig.toml.
 
     Raises:
         ConfigError: a device is not named, or differs from the configuration.
@@ -265,7 +267,7 @@ def open_hardware(config: RigConfig) -> Rig:
     sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
     clock, spec = MonotonicClock(), _spec(found)
     with contextlib.ExitStack() as opened:
-        opened.enter_context(rig_lock(*found["head"].addresses))
+        opened.enter_context(rig_lock(*found["head"].addresses, file=file))
         board = opened.enter_context(contextlib.closing(make_board(board_settings(config.hardware))))
         fixed = opened.enter_context(contextlib.closing(found["fixed"].open(clock)))
         zoom = opened.enter_context(contextlib.closing(found["zoom"].open(clock)))
