@@ -44,8 +44,8 @@ class _Process:
     def install(self) -> None:
         """Install the handlers, unless they are installed."""
         if self._undo is None:
-            handlers = dict.fromkeys(ENDING, self._end) | dict.fromkeys(FREEZING, self._freeze)
-            self._undo = _install(handlers | {signal.SIGINT: self._interrupt})
+            ending = dict.fromkeys((signal.SIGINT, *ENDING), self._end)
+            self._undo = _install(ending | dict.fromkeys(FREEZING, self._freeze))
 
     def remove(self, head: GuardedHead) -> None:
         """Forget a head; remove the handlers after the last one, but for those of `handle_signals`."""
@@ -55,18 +55,11 @@ class _Process:
             self._undo = None
 
     def _end(self, number: int, frame: FrameType | None) -> None:
-        self._stop_elsewhere(number)
-        _leave(number, frame)
-
-    def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        self._stop_elsewhere(number)
-        signal.default_int_handler(number, frame)
-
-    def _stop_elsewhere(self, number: int) -> None:
-        """Stop the heads of other threads, whose blocks the exception in the main thread does not leave."""
+        """Stop the heads of other threads, whose blocks the exception in the main thread does not leave; raise it."""
         for head in self.heads:
             if not head.in_main_thread:
                 head.stop(f"{signal.Signals(number).name} ends the program")
+        (signal.default_int_handler if number == signal.SIGINT else _leave)(number, frame)
 
     def _freeze(self, number: int, frame: FrameType | None) -> None:
         with contextlib.ExitStack() as held:
