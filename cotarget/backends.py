@@ -86,11 +86,11 @@ def open_rig(config: "RigConfig | Path | str", guarded: bool = True, *, file: Pa
     if isinstance(config, str | Path):
         file = Path(config)
         config = load_config(file)
-    rig = _open_hardware(config, file) if config.backend == "hardware" else OPENERS[config.backend](config)
+    rig = OPENERS[config.backend](config, file)
     return guard(rig, config.safety) if guarded else rig
 
 
-def _open_simulation(config: "RigConfig") -> Rig:
+def _open_simulation(config: "RigConfig", _: Path | None) -> Rig:
     from cotarget.sim.world import SimWorld
 
     return SimWorld(config).rig
@@ -102,14 +102,18 @@ def _open_hardware(config: "RigConfig", file: Path | None) -> Rig:
     return open_hardware(config, file)
 
 
-def _open_replay(config: "RigConfig") -> Rig:
+def _open_replay(config: "RigConfig", _: Path | None) -> Rig:
     from cotarget.recording.replay import Replay
 
     return Replay(open_recording(_recording_of(config))).rig
 
 
-# Functions that open the rig of a backend without devices, and without the safety layer.
-OPENERS: dict[str, Callable[["RigConfig"], Rig]] = {"sim": _open_simulation, "replay": _open_replay}
+# Functions that open a backend's rig, of a configuration and its rig.toml, without the safety layer.
+OPENERS: dict[str, Callable[["RigConfig", Path | None], Rig]] = {
+    "sim": _open_simulation,
+    "hardware": _open_hardware,
+    "replay": _open_replay,
+}
 
 
 def open_recording(directory: Path) -> "Recording":

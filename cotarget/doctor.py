@@ -232,11 +232,7 @@ def _devices(config: "RigConfig", rig: Path) -> list[Finding]:
 def _ask(name: str, ask: Callable[[], str | None], there: str, rig: Path) -> Finding:
     try:
         said = ask()
-        return (
-            Finding(name, True, said)
-            if said is not None
-            else Finding(name, None, "is not asked: its driver has no probe")
-        )
+        return Finding(name, None if said is None else True, said or "is not asked: its driver has no probe")
     except CotargetError as error:
         return Finding(name, False, str(error), _fix(error, name, there, rig))
 

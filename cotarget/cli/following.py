@@ -411,10 +411,6 @@ IN_WORDS = {
 }
 
 
-def _without_numbers(reason: str) -> str:
-    return EITHER.sub(r"\1", NUMBER.sub(lambda found: found["name"] or ANY, reason))
-
-
 class Reasons:
     """Counts of the reasons in a run's steps, with numbers ignored: 0.5 s and 0.6 s are one reason."""
 
@@ -426,7 +422,8 @@ class Reasons:
 
     def see(self, step: "Step") -> None:
         """Count the reasons of a step."""
-        parts = {_without_numbers(part): part for part in step.reason.split("; ") if part}
+        latest = [part for part in step.reason.split("; ") if part]
+        parts = {EITHER.sub(r"\1", NUMBER.sub(lambda found: found["name"] or ANY, part)): part for part in latest}
         self._steps += 1
         self._counts.update(parts.keys())
         if self._later_steps or step.target is not None:

@@ -21,6 +21,7 @@ from cotarget.cli import calibrating, following, operating, running
 from cotarget.cli.common import board_corners, duration, length, number, port, positive, ratio, whole
 from cotarget.cli.following import add_selection
 from cotarget.errors import CotargetError
+from cotarget.safety.signals import leave
 
 USAGE = 2  # argparse's own exit status
 
@@ -68,8 +69,6 @@ class CommandParser(Parser):
 # Each command imports the heavy modules (MuJoCo, OpenCV, matplotlib) that it needs, so that --help and wrong arguments
 # answer at once, and `doctor` runs where one of them is broken.
 INTERRUPTED = 130  # a shell's exit status for Ctrl-C
-TERMINATED = 143  # for SIGTERM
-HUNG_UP = 129  # for SIGHUP, from a closed terminal or a broken connection
 KINDS = ("chessboard", "charuco")  # kinds of calibration board
 # The matrices here are small: where other programs use the cores, a second thread of linear algebra makes the work up
 # to 100 times slower. numpy reads the variable when it is imported; a user's OPENBLAS_NUM_THREADS takes precedence.
@@ -92,9 +91,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     """Run the command of parsed options, and print in one line how it ended."""
     # SIGTERM and SIGHUP raise SystemExit, so that the rig halts and files are completed, as on Ctrl-C.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # nohup ignores SIGHUP; keep that
-        signal.signal(signal.SIGHUP, lambda *_: sys.exit(HUNG_UP))
+    for ending in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(ending) is signal.SIG_DFL:  # nohup ignores SIGHUP; keep that
+            signal.signal(ending, leave)
     level = logging.INFO if options.verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(message)s", handlers=[StderrHandler()])
     logging.getLogger("httpx").setLevel(logging.WARNING)  # httpx logs every request at INFO
@@ -147,12 +146,11 @@ class ClosedStdout(io.TextIOBase):
 def _prepare(descriptor: int, name: str) -> None:
     """Let a standard stream write any name; replace a closed one, whose descriptor the next file would get."""
     stream = getattr(sys, name)
-    if stream is not None:
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors=AS_GIVEN)
-        return
-    _open_nothing(descriptor)
-    setattr(sys, name, ClosedStdout() if name == "stdout" else os.fdopen(descriptor, "w", closefd=False))
+    if stream is None:
+        _open_nothing(descriptor)
+        setattr(sys, name, ClosedStdout() if name == "stdout" else os.fdopen(descriptor, "w", closefd=False))
+    elif isinstance(stream, io.TextIOWrapper):
+        stream.reconfigure(errors=AS_GIVEN)
 
 
 def _drop_unwritten(stream: IO[str]) -> None:

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import itertools
 import math
 import sys
 import time
@@ -133,34 +132,26 @@ def _snapshots(
     from cotarget.evaluation import true_calibration
     from cotarget.safety.safe_rig import guard
 
-    seconds = math.inf if options.seconds is None else options.seconds
     with guard(world.rig, config.safety) as rig:
         if options.target is None:
-            yield from _at_rest(rig, world.truth(), seconds)
+            yield from _at_rest(rig, world.truth())
         else:
-            yield from _followed(options, config, calibration or true_calibration(world), world, rig, seconds)
+            yield from _followed(options, config, calibration or true_calibration(world), world, rig)
 
 
-def _at_rest(rig: "Rig", truth: "Truth", seconds: float) -> "Iterator[Snapshot]":
+def _at_rest(rig: "Rig", truth: "Truth") -> "Iterator[Snapshot]":
     from cotarget.sim.viewer.scene import Snapshot, frusta_of
 
     fixed = rig.fixed.read()
-    for _ in itertools.count():
+    while True:
         t = rig.clock.now()
         pictures = {"fixed": fixed.image, "zoom": rig.zoom.read().image}
         yield Snapshot(t, f"t = {t:.1f} s", pictures, frusta_of(truth, t))  # type: ignore[arg-type]
-        if t >= seconds:
-            return
         fixed = rig.fixed.read(newer_than=fixed.t)
 
 
 def _followed(
-    options: argparse.Namespace,
-    config: "RigConfig",
-    calibration: "Calibration",
-    world: "SimWorld",
-    rig: "Rig",
-    seconds: float,
+    options: argparse.Namespace, config: "RigConfig", calibration: "Calibration", world: "SimWorld", rig: "Rig"
 ) -> "Iterator[Snapshot]":
     from cotarget.drawing import draw_wide, draw_zoom
     from cotarget.pipeline import follow
@@ -171,7 +162,7 @@ def _followed(
     target = config.target(name)
     if not options.insist and (text := target_implausibility(target, calibration, rig.spec, name)):
         raise ConfigError(f"{options.rig}: {text}; --insist follows it all the same")
-    for step in follow(rig, calibration, target, seconds=seconds, insist=True):
+    for step in follow(rig, calibration, target, insist=True):
         depths = {} if step.aim is None else {"zoom": step.aim.range}
         caption = f"t = {step.t:.1f} s   {name}: {step.state}"
         pictures = {"fixed": draw_wide(step), "zoom": draw_zoom(step)}

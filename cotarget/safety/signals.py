@@ -59,7 +59,7 @@ class _Process:
         for head in self.heads:
             if not head.in_main_thread:
                 head.stop(f"{signal.Signals(number).name} ends the program")
-        (signal.default_int_handler if number == signal.SIGINT else _leave)(number, frame)
+        (signal.default_int_handler if number == signal.SIGINT else leave)(number, frame)
 
     def _freeze(self, number: int, frame: FrameType | None) -> None:
         with contextlib.ExitStack() as held:
@@ -119,7 +119,7 @@ def end_politely() -> Callable[[], None]:
     Returns:
         A function that removes the handlers.
     """
-    return _install(dict.fromkeys((*ENDING, *FREEZING), _leave)) if is_main_thread() else lambda: None
+    return _install(dict.fromkeys((*ENDING, *FREEZING), leave)) if is_main_thread() else lambda: None
 
 
 def is_main_thread() -> bool:
@@ -127,7 +127,8 @@ def is_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
+def leave(number: int, frame: FrameType | None) -> None:
+    """Raise SystemExit for a signal, with the exit status of a shell."""
     sys.exit(SHELL_STATUS + number)
 
 

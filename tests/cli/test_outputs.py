@@ -98,7 +98,7 @@ def sessions(folder, monkeypatch):
     """Let `calibrate --rig` open a rig without a world, with a replaced session."""
     rig = SimulatedDevices()
     rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, describe(RigConfig()).zoom.focal_range  # 12 x zoom
-    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig, config=config))
+    monkeypatch.setitem(OPENERS, "sim", lambda config, file: rig_of(rig, config=config))
     monkeypatch.setattr("cotarget.cli.calibrating.calibration_summary", lambda found, path: {"verdict": -0.0})
     return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", Session(error))
 
@@ -265,7 +265,7 @@ def pointed(folder, monkeypatch):
         capture=lambda: Frame(image, rig.clock.now()),
         zoom=lambda focal: rig.head.log.append(("zoom", focal)),
     )
-    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig))
+    monkeypatch.setitem(OPENERS, "sim", lambda config, file: rig_of(rig))
     return rig
 
 
