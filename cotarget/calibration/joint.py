@@ -360,10 +360,10 @@ def joint(
         result, wrong, left_out = _cleaned(again, points, prior)
     rejected += left_out
     check_pairs(steps, rms(result.residuals))
-    names, optics = parameter_names(result.free, result.model.stops), (result.model.focal_px, result.model.sizes)
-    open_ = weak_directions(result.normal, names, result.variance or 0.0, *optics)
+    names, lenses = parameter_names(result.free, result.model.stops), result.model.lenses
+    open_ = weak_directions(result.normal, names, result.variance or 0.0, lenses)
     if not options.regularize and len(open_):
-        raise CalibrationError(name_directions(names, open_, *optics))
+        raise CalibrationError(name_directions(names, open_, lenses))
     covariance, held_out, widened = _uncertainty(result, points, prior, options)
     return Solution(
         model=result.model,

@@ -202,16 +202,6 @@ class BundleModel:
         """Every lens, by the prefix of its parameters' names ("fixed", "zoom[0]")."""
         return {"fixed": self.fixed.lens} | {f"zoom[{i}]": stop for i, stop in enumerate(self.head.lens.stops)}
 
-    @property
-    def focal_px(self) -> dict[str, float]:
-        """Focal length of every lens [px], named as in `lenses`."""
-        return {name: lens.focal_px[0] for name, lens in self.lenses.items()}
-
-    @property
-    def sizes(self) -> dict[str, tuple[int, int]]:
-        """Image size (width, height) of every lens [px], named as in `lenses`."""
-        return {name: lens.size for name, lens in self.lenses.items()}
-
     def stop_of(self, view: View) -> int | None:
         """Find the zoom sample of a view; None for the fixed camera's."""
         return None if view.camera == "fixed" else stop_of(self.head.lens.nominal_px, view)

@@ -14,6 +14,7 @@ from types import MappingProxyType
 import numpy as np
 from scipy.linalg import eigh
 
+from cotarget.camera import Intrinsics
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 
@@ -24,10 +25,9 @@ USELESS_POSITION = 0.5  # [m]
 # Limit of use of a lens parameter, in half diagonals of the image: it moves corners near the image's edge by 50 px of
 # 640 x 480, about as much as 5 degrees at a focal length of 600 px.
 USELESS_SHARE, EDGE_SHARE = 0.125, 0.9
-USUAL_SIZE, USUAL_FOCAL_PX = (640, 480), 600.0
+USUAL_LENS = Intrinsics((640, 480), (600.0, 600.0), (319.5, 239.5))
 USELESS_SCALE = 0.1  # limit of use of an encoder's scale: 5 of 50 degrees
-NO_FOCAL_PX: Mapping[str, float] = MappingProxyType({})
-NO_SIZES: Mapping[str, tuple[int, int]] = MappingProxyType({})
+NO_LENSES: Mapping[str, Intrinsics] = MappingProxyType({})
 TILT_BOARDS = "tilt the boards against the camera by 20 to 40 degrees, in several directions"
 OUTWARD = "show boards out to the image's corners"
 FARTHER = "show a larger board farther away, where the head reaches and the fixed camera still finds it"
@@ -112,11 +112,7 @@ def judge_motions(normal: Array, noise: Array, motions: RigidTransform, turns_ba
 
 
 def weak_directions(
-    normal: Array,
-    parameters: Sequence[str],
-    variance: float,
-    focal_px: Mapping[str, float] = NO_FOCAL_PX,
-    sizes: Mapping[str, tuple[int, int]] = NO_SIZES,
+    normal: Array, parameters: Sequence[str], variance: float, lenses: Mapping[str, Intrinsics] = NO_LENSES
 ) -> Array:
     """Find the directions that a normal matrix leaves undetermined, measured by the parameters' limits of use.
 
@@ -124,8 +120,8 @@ def weak_directions(
         normal: normal matrix (n, n); its inverse times the variance is the covariance.
         parameters: names of the n parameters, as in `Covariance`.
         variance: variance of one coordinate [px^2]; 0 to find what even exact corners leave undetermined.
-        focal_px: focal length of each lens [px], by the prefix of its parameters' names; 600 px for those not given.
-        sizes: image size of each lens (width, height) [px], likewise; 640 x 480 for those not given.
+        lenses: lenses by the prefix of their parameters' names, as in `BundleModel.lenses`; for those not given, one
+            of 600 px with an image of 640 x 480.
 
     Returns:
         Directions (k, n) in the parameters' units, the least known first. Divided by the limits of use they are
@@ -134,25 +130,19 @@ def weak_directions(
     Raises:
         CalibrationError: a parameter's name is unknown.
     """
-    limits = limits_of_use(parameters, focal_px, sizes)
+    limits = limits_of_use(parameters, lenses)
     values, vectors = np.linalg.eigh(normal * np.outer(limits, limits))
     weak = values < max(variance, ROUNDING * values[-1])
     return (vectors[:, weak] * limits[:, None]).T
 
 
-def name_directions(
-    parameters: Sequence[str],
-    directions: Array,
-    focal_px: Mapping[str, float] = NO_FOCAL_PX,
-    sizes: Mapping[str, tuple[int, int]] = NO_SIZES,
-) -> str:
+def name_directions(parameters: Sequence[str], directions: Array, lenses: Mapping[str, Intrinsics] = NO_LENSES) -> str:
     """Describe undetermined directions in words, with what to add.
 
     Args:
         parameters: names of the n parameters, as in `Covariance`.
         directions: independent directions in the parameters' units, (k, n), as `weak_directions` returns them.
-        focal_px: focal length of each lens [px], as in `weak_directions`.
-        sizes: image size of each lens [px], as in `weak_directions`.
+        lenses: as in `weak_directions`.
 
     Returns:
         One sentence without a full stop; empty where there are no directions.
@@ -163,7 +153,7 @@ def name_directions(
     if not len(directions):
         return ""
     # The projection depends only on the space that the directions span.
-    basis = np.linalg.qr((directions / limits_of_use(parameters, focal_px, sizes)).T)[0]
+    basis = np.linalg.qr((directions / limits_of_use(parameters, lenses)).T)[0]
     part = np.sum(basis**2, axis=1)
     reason = ""
     what: list[str] = []
@@ -187,17 +177,13 @@ def name_directions(
     return f"{reason}{listed(what)} {'is' if len(what) == 1 else 'are'} free; {listed(add)}"
 
 
-def limits_of_use(
-    parameters: Sequence[str],
-    focal_px: Mapping[str, float] = NO_FOCAL_PX,
-    sizes: Mapping[str, tuple[int, int]] = NO_SIZES,
-) -> Array:
+def limits_of_use(parameters: Sequence[str], lenses: Mapping[str, Intrinsics] = NO_LENSES) -> Array:
     """Look up the limit of use of each parameter, in its unit, (n,); see `weak_directions`."""
     limits = []
     for name in parameters:
         owner, _, kind = name.rpartition(".")
-        f = focal_px.get(owner, USUAL_FOCAL_PX)
-        half_px = math.hypot(*sizes.get(owner, USUAL_SIZE)) / 2
+        lens = lenses.get(owner, USUAL_LENS)
+        f, half_px = lens.focal_px[0], math.hypot(*lens.size) / 2
         useless_px, r = USELESS_SHARE * half_px, EDGE_SHARE * half_px / f
         match kind:
             case "rx" | "ry" | "rz" | "squareness" | "pan_zero" | "tilt_zero":

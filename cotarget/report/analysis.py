@@ -279,14 +279,14 @@ def left_open(calibration: Calibration) -> str:
     covariance, held_out = calibration.covariance, calibration.held_out
     if covariance is None or not covariance.matrix.any():
         return ""
-    model = model_of(calibration)
-    limits = limits_of_use(covariance.parameters, model.focal_px, model.sizes)
+    lenses = model_of(calibration).lenses
+    limits = limits_of_use(covariance.parameters, lenses)
     widened = 1.0 if held_out is None else held_out.widened
     # Divided by the limits, because eigenvalues of a matrix of mixed units are lost by rounding, as are those of its
     # inverse.
     values, vectors = np.linalg.eigh(covariance.matrix / np.outer(limits, limits))
     weak = (vectors[:, values > widened**2] * limits[:, None]).T
-    return name_directions(covariance.parameters, weak, model.focal_px, model.sizes)
+    return name_directions(covariance.parameters, weak, lenses)
 
 
 # Evidence from the stored corners

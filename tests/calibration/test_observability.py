@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cotarget.calibration.observability import name_directions, weak_directions
+from cotarget.camera import Intrinsics
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform, Rotation, pose
 from experiments.calibration.synthetic.rig import Truth
@@ -75,6 +76,10 @@ def hand_normal(angles):
     return without_boards(*zip(*parts, strict=True))
 
 
+def lens_of(focal_px, size=(640, 480)):
+    return Intrinsics(size, (focal_px, focal_px), (0.0, 0.0))
+
+
 OF_HEAD = ("axis offset", "squareness")
 
 
@@ -91,9 +96,9 @@ def test_limits_of_use_scale_with_the_focal_length():
     ]
     normal = lens_normal(boards, 7000.0)
     assert "distortion" in name_directions(LENS_NAMES, weak_directions(normal, LENS_NAMES, SIGMA_PX**2))
-    focal_px = {"fixed": 7000.0}
-    weak = weak_directions(normal, LENS_NAMES, SIGMA_PX**2, focal_px)
-    assert "distortion" not in name_directions(LENS_NAMES, weak, focal_px)
+    lenses = {"fixed": lens_of(7000.0)}
+    weak = weak_directions(normal, LENS_NAMES, SIGMA_PX**2, lenses)
+    assert "distortion" not in name_directions(LENS_NAMES, weak, lenses)
 
 
 @pytest.mark.parametrize("width", [640, 1920, 3264])
@@ -101,11 +106,11 @@ def test_limits_of_use_scale_with_the_focal_length():
 def test_limits_of_use_scale_with_the_image(width, edge_px, undetermined):
     """Of a lens in 640 x 480 px, whose edge is 360 px from the middle, or the same lens with finer pixels."""
     times = width / 640
-    focal, size = {"fixed": 600.0 * times}, {"fixed": (width, width * 3 // 4)}
+    lenses = {"fixed": lens_of(600.0 * times, (width, width * 3 // 4))}
     for name, sigma in (("fixed.k1", edge_px / (600 * 0.6**3)), ("fixed.cx", edge_px * times)):
-        weak = weak_directions(np.array([[1 / sigma**2]]), [name], 1.0, focal, size)
+        weak = weak_directions(np.array([[1 / sigma**2]]), [name], 1.0, lenses)
         assert bool(len(weak)) == undetermined
-    assert "distortion" in name_directions(["fixed.k1"], np.array([[1.0]]), focal, size)
+    assert "distortion" in name_directions(["fixed.k1"], np.array([[1.0]]), lenses)
 
 
 @pytest.mark.parametrize(("angles", "begins", "free"), [
