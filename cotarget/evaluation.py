@@ -119,13 +119,12 @@ class TruthDetector:
         truth: Appearances,
         seed: int,
         noise: TruthNoise = TruthNoise(),
-        names: Iterable[str] | None = None,
         camera: CameraName = "fixed",
     ) -> None:
-        """Create a detector of the targets with these names, by default all, in the frames of one camera."""
+        """Create a detector of all targets in the frames of one camera."""
         self._camera = camera
         self._truth, self._noise, self._numbers_at = truth, noise, counted(seed)
-        self._names = tuple(truth.targets if names is None else names)
+        self._names = tuple(truth.targets)
 
     def detect(self, frame: Frame) -> list[Detection]:
         """Detect the targets, largest first."""

@@ -140,13 +140,7 @@ def size_implausibility(target: TargetProfile, name: str = "") -> str:
 
 
 def target_implausibility(target: TargetProfile, calibration: Calibration, spec: RigSpec, name: str = "") -> str:
-    """Describe what of a target profile is far outside of anything plausible on a rig; empty where nothing is.
-
-    Args:
-        target: the target profile.
-        calibration: calibration of the rig.
-        spec: description of the rig in use.
-        name: name of the target in the rig's configuration; its kind, such as that of ``bird2``, has a usual size.
+    """Describe what of a target profile is implausible on a rig, see `size_implausibility`; empty where nothing is.
 
     Raises:
         ConfigError: a stream has another aspect ratio than that calibrated.

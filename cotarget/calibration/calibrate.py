@@ -66,7 +66,7 @@ def beyond_shortest(name: str, focal_px: float, shortest_px: float) -> Rejected:
 
 
 def find_views(
-    directory: Path, index: CaptureIndex, progress: Progress | None, options: Options
+    directory: Path, index: CaptureIndex, progress: Progress, options: Options
 ) -> tuple[list[View], list[Rejected], dict[CameraName, tuple[int, int]]]:
     """Find the boards in all images of an index; for the sequential method, only at the shortest focal length.
 
@@ -79,8 +79,7 @@ def find_views(
     focals = [c.focal_px for c in index.captures if c.camera == "zoom" and c.focal_px is not None]
     shortest = min(focals, default=0.0)
     for done, capture in enumerate(read_images(directory, index.captures)):
-        if progress is not None:
-            progress(done, len(index.captures), f"looking for the board in {capture.source}")
+        progress(done, len(index.captures), f"looking for the board in {capture.source}")
         sizes[capture.camera] = (capture.image.shape[1], capture.image.shape[0])
         if capture.camera == "zoom" and capture.focal_px is not None and capture.focal_px > shortest * (1 + SAME_FOCAL):
             if options.method == "sequential":
@@ -100,8 +99,7 @@ def find_views(
     if not views:
         raise CalibrationError(f"{directory}: {_why_none(directory, index, rejected)}")
     if later:
-        if progress is not None:
-            progress(len(index.captures), len(index.captures), "fitting the shortest focal length")
+        progress(len(index.captures), len(index.captures), "fitting the shortest focal length")
         more, lost = _find_parts(directory, views, later, index.board, sizes, replace(options, folds=0))
         views += more
         rejected += lost

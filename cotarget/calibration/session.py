@@ -434,7 +434,7 @@ def capture_session(
     recorder: CaptureRecorder,
     placements: int,
     rng: np.random.Generator,
-    progress: Progress | None = None,
+    progress: Progress,
     *,
     stops: int = 1,
     far_placements: int = 0,
@@ -449,8 +449,7 @@ def capture_session(
     total = placements + (far_placements if len(nominal) > 1 else 0)
 
     def report(text: str) -> None:
-        if progress is not None:
-            progress(min(recorder.number + 1, total), total, text)
+        progress(min(recorder.number + 1, total), total, text)
 
     try:
         recorder.start()
@@ -469,8 +468,7 @@ def capture_session(
         raise
     recorder.save_index()
     recorder.rig.board.present(None)
-    if progress is not None:
-        progress(total, total, "fitting")
+    progress(total, total, "fitting")
 
 
 def _check_least(name: str, value: int, least: int) -> None:

@@ -164,17 +164,7 @@ class D46Link:
 
 
 class D46Head(PolledHead):
-    """A PTU-D46 at a serial port.
-
-    Args:
-        config: port, baud rate, limits, step and signs that the unit must report.
-        clock: the rig's clock.
-        safety: speed cap and stop file.
-
-    Raises:
-        ConfigError: the unit differs from the configuration.
-        DeviceError: there is no unit, or it cannot be used in its state.
-    """
+    """A PTU-D46 at a serial port; arguments and errors are those of `PolledHead`."""
 
     Settings = D46Settings
 

@@ -14,7 +14,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from cotarget.config import RigConfig, SimCamera
 from cotarget.emulators.plant import Feed, Picture
@@ -125,14 +125,6 @@ STILL_INDEX = 1_000_000_000  # first frame index of stills, whose noise must dif
 CHECK_S = 0.25  # period of checking for the end [s]
 
 
-@dataclass(frozen=True, eq=False)
-class _Still:
-    """A request for a still: time of its exposure [s], and queue for the image."""
-
-    t: float
-    answer: "queue.SimpleQueue[Image]"
-
-
 def paced(config: RigConfig) -> RigConfig:
     """Adapt a configuration to real time: lower frame rates, no shadows, no multisampling, and JPEG by the servers."""
     sim = config.sim
@@ -158,7 +150,8 @@ class LiveWorld(Closes):
         self.config = config
         self.feeds: dict[CameraName, Feed] = {"fixed": Feed(), "zoom": Feed()}
         self.clock = WallClock()
-        self._stills: queue.SimpleQueue[_Still] = queue.SimpleQueue()
+        # Requests of stills: time of the exposure [s], and queue for the image.
+        self._stills: queue.SimpleQueue[tuple[float, queue.SimpleQueue[Image]]] = queue.SimpleQueue()
         self._due: queue.SimpleQueue[tuple[float, CameraName, Picture] | None] = queue.SimpleQueue()
         self._ended = threading.Event()
         self._failure = ""
@@ -201,7 +194,7 @@ class LiveWorld(Closes):
         """
         self.check()
         answer: queue.SimpleQueue[Image] = queue.SimpleQueue()
-        self._stills.put(_Still(self.clock.now(), answer))
+        self._stills.put((self.clock.now(), answer))
         try:
             return answer.get(timeout=STILL_TIMEOUT)
         except queue.Empty:
@@ -254,11 +247,11 @@ class LiveWorld(Closes):
         numbers = itertools.count(STILL_INDEX)
         while not self._ended.is_set():
             try:
-                still = self._stills.get_nowait()
+                t, answer = self._stills.get_nowait()
             except queue.Empty:
                 pass
             else:
-                still.answer.put(world.expose("zoom", next(numbers), still.t))
+                answer.put(world.expose("zoom", next(numbers), t))
                 continue
             name = min(next_index, key=lambda n: next_index[n] / cameras[n].rate_hz)
             index, rate = next_index[name], cameras[name].rate_hz

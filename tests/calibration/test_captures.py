@@ -118,7 +118,7 @@ def test_sequential_method_rejects_images_beyond_the_shortest_focal_length(tmp_p
     for name in ("a.png", "b.png", "c.png"):
         cv2.imwrite(str(tmp_path / name), draw_board(BoardConfig(), 30))
     write(tmp_path, [FIXED, ZOOM, ZOOM | {"file": "c.png", "focal_px": 1334.0}])
-    views, rejected, _ = find_views(tmp_path, read_index(tmp_path), None, Options("sequential"))
+    views, rejected, _ = find_views(tmp_path, read_index(tmp_path), lambda *_: None, Options("sequential"))
     assert [view.source for view in views] == ["a.png", "b.png"]
     assert [one.name for one in rejected] == ["c.png"]
 

@@ -88,7 +88,7 @@ def test_saved_images_are_in_memory_one_at_a_time(session, monkeypatch):
     beyond = [one for one in index.captures if one.focal_px is not None and one.focal_px > 1.1 * NOMINAL_PX]
     few = [one for one in index.captures if (one not in beyond and one.board % 2 == 0) or one in beyond[:BEYOND]]
     monkeypatch.setattr(cv2, "imdecode", decoded)
-    views, *_ = find_views(directory, replace(index, captures=tuple(few)), None, QUICK)
+    views, *_ = find_views(directory, replace(index, captures=tuple(few)), lambda *_: None, QUICK)
     assert {view.source for view in views} >= {one.source for one in beyond[:BEYOND]}
     assert 0 < most <= 2  # the last one is gone once the next is read
 
