@@ -263,18 +263,6 @@ def score_tracks(
     )
 
 
-def off_boxes(
-    tracks: Iterable[Tracked], boxes: Mapping[int, Sequence[Box]], criterion: Criterion = Criterion()
-) -> list[Tracked]:
-    """Leave out what lies on boxes that must not count, by frame number: flyers that have no label."""
-    kept = []
-    for frame, found in _by_frame(tracks).items():
-        near = criterion.similarity(boxes.get(frame, []), found) >= criterion.iou - np.finfo(float).eps
-        excused: list[bool] = np.any(near, axis=0).tolist()
-        kept += [each for each, excuse in zip(found, excused, strict=True) if not excuse]
-    return kept
-
-
 def _ratios(boxes: int, found: int, false_boxes: int, switches: int, id_found: int) -> dict[str, float | None]:
     return {
         "recall": _ratio(found, boxes),

@@ -342,10 +342,17 @@ def libraries_used() -> dict[str, str]:
 @functools.cache
 def versions() -> dict[str, str]:
     """Give the versions of Python, the libraries and OpenGL's renderer, which is empty without OpenGL."""
-    from cotarget.sim.render.opengl import renderer_version
+    with contextlib.suppress(Exception):  # experiments without pictures run without OpenGL, which raises anything
+        from cotarget.sim.render.opengl import mujoco
 
-    with contextlib.suppress(CotargetError):  # experiments without pictures run without OpenGL
-        return libraries_used() | {"opengl": renderer_version()}
+        context = mujoco.GLContext(8, 8)
+        try:
+            context.make_current()
+            gl = importlib.import_module("OpenGL.GL")
+            found = ", ".join(gl.glGetString(name).decode() for name in (gl.GL_RENDERER, gl.GL_VERSION))
+            return libraries_used() | {"opengl": found}
+        finally:
+            context.free()
     return libraries_used() | {"opengl": ""}
 
 

@@ -13,11 +13,9 @@ from cotarget.cli.main import main
 from cotarget.detection import make_detector
 from cotarget.errors import ConfigError
 from cotarget.track_metrics import (
-    Box,
     Criterion,
     Label,
     Tracked,
-    off_boxes,
     pooled,
     read_labels,
     read_tracks,
@@ -482,12 +480,3 @@ def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):
     assert f"1 of {len(steps) + 1} labelled frames are beyond the last one, {len(steps) - 1}," in err
     assert main([*arguments, str(tmp_path / "none.csv")]) == 1
     assert "none.csv" in capsys.readouterr().err
-
-
-def test_what_lies_on_a_box_that_must_not_count_is_left_out():
-    bird = Box(np.array([50.0, 50.0]), np.array([10.0, 10.0]))
-    on, off, later = (
-        Tracked(np.array(at), np.array([10.0, 10.0]), frame, frame / 25, 1)
-        for at, frame in (([53.0, 50.0], 3), ([70.0, 50.0], 3), ([50.0, 50.0], 4))
-    )
-    assert off_boxes([on, off, later], {3: [bird]}) == [off, later]

@@ -22,7 +22,7 @@ from cotarget.detection.background import pieces
 from cotarget.detection.base import box_detection
 from cotarget.files import read_table
 from cotarget.rig import Frame, Image
-from cotarget.track_metrics import Box, Criterion, Label, Tracked, off_boxes, read_labels, score_tracks
+from cotarget.track_metrics import Box, Criterion, Label, Tracked, read_labels, score_tracks
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import RegisteringDetector, Tracker, update_tracks
 from cotarget.video import Film
@@ -41,6 +41,17 @@ FALSE_PER_MIN = (0.5, 5.0, 50.0)
 AHEAD = 0.05
 # Gaps that are closed in the mixtures' foreground [px].
 BRIDGE_PX = (3, 3)
+
+
+def off_boxes(tracks: Iterable[Tracked], boxes: Mapping[int, Sequence[Box]], criterion: Criterion) -> list[Tracked]:
+    """Leave out what lies on boxes that must not count, by frame number: flyers that have no label."""
+    kept = []
+    for frame, group in itertools.groupby(sorted(tracks, key=lambda each: each.frame), key=lambda each: each.frame):
+        found = list(group)
+        near = criterion.similarity(boxes.get(frame, []), found) >= criterion.iou - np.finfo(float).eps
+        excused: list[bool] = np.any(near, axis=0).tolist()
+        kept += [each for each, excuse in zip(found, excused, strict=True) if not excuse]
+    return kept
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments.following.films import missed, summarise, unlabelled_flyers
+from cotarget.track_metrics import Box, Criterion, Tracked
+from experiments.following.films import missed, off_boxes, summarise, unlabelled_flyers
 
 
 def row(way, threshold, found, false_tracks, no_flyer):
@@ -52,3 +53,12 @@ def test_flyers_without_a_label_are_between_the_boxes_listed():
     assert box.size_px == pytest.approx([2, 4])
     assert unlabelled_flyers("V_DRONE_008") == {}
     assert np.mean([len(unlabelled_flyers("V_BIRD_022")[frame]) for frame in (194, 200)]) >= 3
+
+
+def test_what_lies_on_a_box_that_must_not_count_is_left_out():
+    bird = Box(np.array([50.0, 50.0]), np.array([10.0, 10.0]))
+    on, off, later = (
+        Tracked(np.array(at), np.array([10.0, 10.0]), frame, frame / 25, 1)
+        for at, frame in (([53.0, 50.0], 3), ([70.0, 50.0], 3), ([50.0, 50.0], 4))
+    )
+    assert off_boxes([on, off, later], {3: [bird]}, Criterion()) == [off, later]

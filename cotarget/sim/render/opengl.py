@@ -3,9 +3,7 @@
 Import ``mujoco`` from this module before anything renders: it sets MUJOCO_GL, which mujoco reads when it is imported.
 """
 
-import contextlib
 import ctypes.util
-import importlib
 import os
 import sys
 from functools import cache
@@ -18,7 +16,7 @@ from cotarget.errors import DeviceError
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
-__all__ = ["BACKEND", "TALLY", "Canvas", "make_renderer", "mujoco", "renderer_version"]
+__all__ = ["BACKEND", "TALLY", "Canvas", "make_renderer", "mujoco"]
 INSTALL = {
     "egl": "install it: apt-get install -y libegl1 libgl1-mesa-dri libgl1",
     "osmesa": "install it: apt-get install -y libosmesa6, or unset MUJOCO_GL",
@@ -89,20 +87,6 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
 def _first_process() -> int:
     """Give the id of the first process that opens OpenGL; a forked process inherits the value."""
     return os.getpid()
-
-
-@cache
-def renderer_version() -> str:
-    """Give OpenGL's renderer and version, on which pictures depend; empty where there is no OpenGL."""
-    with contextlib.suppress(Exception):  # PyOpenGL and the backends raise whatever they meet
-        context = mujoco.GLContext(8, 8)
-        try:
-            context.make_current()
-            gl = importlib.import_module("OpenGL.GL")
-            return ", ".join(gl.glGetString(name).decode() for name in (gl.GL_RENDERER, gl.GL_VERSION))
-        finally:
-            context.free()
-    return ""
 
 
 class Canvas:
