@@ -14,11 +14,11 @@ from cotarget.backends import open_rig
 from cotarget.config import RigConfig
 from cotarget.detection import Detection, make_detector
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.emulators.process import EmulatedRig
 from cotarget.pipeline import follow
 from cotarget.rig import Clock, Frame, Rig, Speed
 from cotarget.safety.safe_rig import guard
 from experiments.engine import Row
+from experiments.wire.process import EmulatedRig
 from experiments.wire.rig import Tap, exact_calibration, load, tapped
 
 SCENES = {"book": "indoor", "person": "outdoor"}

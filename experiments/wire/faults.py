@@ -23,11 +23,11 @@ import numpy as np
 from cotarget.backends import describe
 from cotarget.config import parse_config
 from cotarget.emulators.emulation import FAULTS
-from cotarget.emulators.process import EmulatedRig, end
 from cotarget.geometry import Array
 from cotarget.sim.targets.paths import waypoint_path
 from cotarget.targeting import Reach, aim
 from experiments.engine import Row
+from experiments.wire.process import EmulatedRig, end
 from experiments.wire.rig import MOUNT, exact_calibration, load
 
 # The book's ellipse: x and z about the fixed camera's axis, at a distance [m], and its period [s].

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from cotarget.emulators.process import EmulatedRig
 from cotarget.latency import measure_fixed, measure_head
 from cotarget.rig import Camera, Frame, Speed
 from cotarget.safety.safe_rig import guard
 from experiments.engine import Row
 from experiments.wire.command import ORDER, Notes, TimedHead, Turn, open_tapped
 from experiments.wire.polls import BYTES_S
+from experiments.wire.process import EmulatedRig
 from experiments.wire.rig import Tap, exact_calibration, load
 
 LOOK_S = 0.01  # polling interval of the newest exposures [s]

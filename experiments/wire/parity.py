@@ -12,13 +12,13 @@ import numpy as np
 from cotarget.backends import open_rig
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
-from cotarget.emulators.process import LONGEST_S, EmulatedRig
 from cotarget.emulators.world import paced
 from cotarget.pipeline import follow
 from cotarget.rig import Rig
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
 from experiments.engine import Row
+from experiments.wire.process import LONGEST_S, EmulatedRig
 from experiments.wire.rig import MOUNT, exact_calibration, load
 
 NAME = "book"

@@ -8,12 +8,12 @@ from pathlib import Path
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.ptu_d46 import D46Head, D46Settings
 from cotarget.drivers.rig import devices
-from cotarget.emulators.process import EmulatedRig
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.ports import UnitPorts
 from cotarget.emulators.ptu_d46.unit import D46_PAPER
 from cotarget.emulators.serve import Faults
 from experiments.engine import Row
+from experiments.wire.process import EmulatedRig
 from experiments.wire.rig import Tap, beside, load, tapped
 
 BAUD, BITS = 9600, 10

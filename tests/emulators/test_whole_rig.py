@@ -21,11 +21,11 @@ from cotarget.backends import describe, load_config
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.emulators.emulation import FAULTS
-from cotarget.emulators.process import EmulatedRig
 from cotarget.errors import DeviceError
 from cotarget.evaluation import true_calibration
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, WantedSize, aim, point_at
+from experiments.wire.process import EmulatedRig
 from tests.support.commands import call
 from tests.support.plants import wait_for
 
