@@ -45,27 +45,15 @@ LATE_PERIODS = 2.5  # longest time between two frames or two reports of the head
 FEWEST_CORNERS = 12  # with fewer corners there is no scale
 
 
-@dataclass(frozen=True)
-class LensLatency:
-    """Result of zooming in and out.
-
-    Attributes:
-        command: time from a command to the start of the lens's motion, median over all ways [s].
-        spread: half the interquartile range of that time [s].
-        frames: number of frames of the zoom camera.
-    """
-
-    command: float
-    spread: float
-    frames: int
-
-
-def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
+def measure_lens(rig: Rig, late_s: float = 0.0) -> float:
     """Measure the lens's command delay from the growth of the image while it zooms in and out.
 
     Args:
         rig: the rig; its head stays where it is.
         late_s: latency error of the zoom camera, by which its frames are dated too late, see `measure_head` [s].
+
+    Returns:
+        Time from a command to the start of the lens's motion, median over all ways [s].
 
     Raises:
         CalibrationError: the lens hardly zooms or does not come to rest, or the image does not grow as reported.
@@ -78,13 +66,11 @@ def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
     rig.zoom.zoom(shortest)
     before = wait_for_lens(rig).focal_px
     delays: list[float] = []
-    count = 0
     for way in range(WAYS):
         frames = _lens_frames(rig, rig.clock.now() + BEFORE_S)
         t = rig.clock.now()
         after = rig.zoom.zoom(shortest if way % 2 else goal)
         frames += _moving_frames(rig, frames)
-        count += len(frames)
         grown = log_scales([frame.image for frame in frames])
         reported = math.log(after / before)
         if not abs(grown[-1] - reported) <= AS_REPORTED * abs(reported):
@@ -98,8 +84,7 @@ def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
         times = np.array([frame.t for frame in frames]) - late_s
         delays.append(start_of_motion(times, grown / grown[-1]) - t)
         before = after
-    low, middle, high = np.percentile(delays, (25, 50, 75)).tolist()
-    return LensLatency(middle, (high - low) / 2, count)
+    return float(np.percentile(delays, 50))
 
 
 def lateness(frames: Sequence[float], rate_hz: float, states: Sequence[float] = ()) -> str:
@@ -286,7 +271,7 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
 
 def measure_fixed(
     rig: Rig, calibration: Calibration, board: BoardConfig, seconds: float = SWING_SECONDS
-) -> tuple[Delay, int]:
+) -> Delay:
     """Measure the latency of the fixed camera against the zoom camera with a swinging board.
 
     Args:
@@ -296,8 +281,7 @@ def measure_fixed(
         seconds: duration [s].
 
     Returns:
-        Delay by which the fixed camera's frames are dated too late, to be added to its latency; and the number of its
-        frames that showed the board.
+        Delay by which the fixed camera's frames are dated too late, to be added to its latency.
 
     Raises:
         CalibrationError: one of the cameras does not see the board often enough, or the records do not agree.
@@ -334,7 +318,7 @@ def measure_fixed(
             f"the cameras' views of the swinging board do not agree (correlation {delay.agreement:.2f}); swing "
             "it left and right"
         )
-    return delay, len(t_fixed)
+    return delay
 
 
 def delay_between(t: Array, values: Array, t_other: Array, other: Array) -> Delay:

@@ -241,9 +241,8 @@ def test_the_fixed_camera_against_the_zoom_camera(world):
         ),
     )
     late = replace(world.rig, fixed=LateCamera(world.rig.fixed, 0.03))
-    found, frames = measure_fixed(late, calibration, world.config.board, seconds=4.0)
+    found = measure_fixed(late, calibration, world.config.board, seconds=4.0)
     assert found.seconds == pytest.approx(0.03, abs=CLOSE)
-    assert frames > 40
     with pytest.raises(CalibrationError, match="the fixed camera saw the swinging board in"):
         measure_fixed(late, calibration, world.config.board, seconds=1.0)
 
@@ -285,8 +284,7 @@ def test_the_simulated_lens(late):
     config = parse_config({"sim": {"zoom": SMALL_LENS, "head": {"command_delay_s": 0.12}}})
     with SimWorld(config).rig as rig:
         found = measure_lens(replace(rig, zoom=LateCamera(rig.zoom, late)), late)
-        assert found.command == pytest.approx(0.12, abs=LENS_CLOSE)
-        assert found.spread < LENS_CLOSE
+        assert found == pytest.approx(0.12, abs=LENS_CLOSE)
         assert rig.zoom.state().focal_px == pytest.approx(rig.zoom.focal_range[0])
 
 

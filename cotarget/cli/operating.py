@@ -287,9 +287,9 @@ def latency_command(options: argparse.Namespace) -> None:
         }
         agreement = {"zoom": head.zoom.agreement}
         if config.backend == "hardware":  # a simulated lens has the head's command delay
-            found["hardware.zoom.command_delay_s"] = measure_lens(rig, head.zoom.seconds).command
+            found["hardware.zoom.command_delay_s"] = measure_lens(rig, head.zoom.seconds)
         if calibration is not None:
-            fixed, _ = measure_fixed(rig, calibration, config.board)
+            fixed = measure_fixed(rig, calibration, config.board)
             # Relative to the zoom camera, whose frame times contain the error found above.
             found[f"{where}.fixed.latency_s"] = rig.spec.fixed.latency_s + fixed.seconds + head.zoom.seconds
             agreement["fixed"] = fixed.agreement

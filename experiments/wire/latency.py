@@ -110,7 +110,7 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
             found = measure_head(noted, head_seconds)
             orders = true_command_delays(notes, taps[0], emulated.sim.sim.head.command_delay_s)
             calibration = exact_calibration(emulated.sim)
-            swing, _ = measure_fixed(noted, calibration, config.board, board_seconds)
+            swing = measure_fixed(noted, calibration, config.board, board_seconds)
         truth = {
             "fixed": true_latencies(cameras["fixed"], rig.spec.fixed.latency_s, watcher.exposures["fixed"]),
             "zoom": true_latencies(cameras["zoom"], rig.spec.zoom.latency_s, watcher.exposures["zoom"]),
