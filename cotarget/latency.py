@@ -269,9 +269,7 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     return HeadLatency(zoom, command, len(times), late)
 
 
-def measure_fixed(
-    rig: Rig, calibration: Calibration, board: BoardConfig, seconds: float = SWING_SECONDS
-) -> Delay:
+def measure_fixed(rig: Rig, calibration: Calibration, board: BoardConfig, seconds: float = SWING_SECONDS) -> Delay:
     """Measure the latency of the fixed camera against the zoom camera with a swinging board.
 
     Args:

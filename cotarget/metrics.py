@@ -201,13 +201,10 @@ def read_rows(path: Path) -> list[Row]:
     Raises:
         ConfigError: the file is missing, or is no steps.csv.
     """
-    parse: dict[Any, Callable[[str], Any]] = {int: int, float: float, str: str, bool: _truth_value}
+    truth_values = {"True": True, "False": False}
+    parse: dict[Any, Callable[[str], Any]] = {int: int, float: float, str: str, bool: truth_values.__getitem__}
     columns = {f.name: parse[f.type] for f in dataclasses.fields(Row)}
     return [Row(**row) for row in read_table(path, columns, "steps.csv")]
-
-
-def _truth_value(text: str) -> bool:
-    return {"True": True, "False": False}[text]
 
 
 # Scores of a run

@@ -122,10 +122,6 @@ def _refuse_disorder(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-def _pose(value: "_PoseTable") -> RigidTransform:
-    return pose(value.translation, value.rotvec_deg)
-
-
 @dataclass(frozen=True)
 class _AsPose:
     """Read a pose from its table."""
@@ -133,7 +129,9 @@ class _AsPose:
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic_core import core_schema
 
-        return core_schema.no_info_after_validator_function(_pose, handler.generate_schema(_PoseTable))
+        return core_schema.no_info_after_validator_function(
+            lambda table: pose(table.translation, table.rotvec_deg), handler.generate_schema(_PoseTable)
+        )
 
 
 Pair = tuple[float, float]

@@ -238,6 +238,7 @@ def score_tracks(
     matches = match_frames(tracks, {k: boxes for k, boxes in labelled.items() if k < frames}, criterion)
     scored = [each for each in matches if each.frame >= learning_frames]
     pairs = [pair for each in scored for pair in each.pairs]
+    offsets_px = [np.linalg.norm(label.center_px - track.center_px) for label, track in pairs]
     seconds = len(scored) / rate_hz
     boxes = len(pairs) + sum(len(each.missed) for each in scored)
     false_boxes = sum(len(each.false) for each in scored)
@@ -247,7 +248,7 @@ def score_tracks(
         labelled_frames=len(scored),
         on_target_ratio=_ratio(sum(bool(each.pairs) for each in scored), len(scored)),
         numbers=len({track.track for _, track in pairs}),
-        offset_px_median=float(np.median([_distance(*pair) for pair in pairs])) if pairs else None,
+        offset_px_median=float(np.median(offsets_px)) if pairs else None,
         fragmentation_per_min=60 * _gaps(scored, rate_hz) / seconds if pairs else None,
         false_tracks=false,
         false_tracks_per_min=60 * false * rate_hz / frames if frames else None,
@@ -274,10 +275,6 @@ def _ratios(boxes: int, found: int, false_boxes: int, switches: int, id_found: i
 
 def _ratio(part: float, whole: float) -> float | None:
     return part / whole if whole else None
-
-
-def _distance(label: Label, track: Tracked) -> float:
-    return float(np.linalg.norm(label.center_px - track.center_px))
 
 
 def _id_switches(matches: Sequence[FrameMatch]) -> int:

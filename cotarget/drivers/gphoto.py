@@ -232,8 +232,6 @@ class GphotoLink:
         camera: Any = None
         with standard_input_kept():
             try:
-                ports.load()
-                abilities.load()
                 model, port = self._find(ports, abilities)
                 camera = gp.Camera()
                 camera.set_abilities(abilities.get_abilities(abilities.lookup_model(model)))
@@ -255,15 +253,15 @@ class GphotoLink:
         gp = _gphoto2()
         ports, abilities = gp.PortInfoList(), gp.CameraAbilitiesList()
         try:
-            ports.load()
-            abilities.load()
             model, port = self._find(ports, abilities)
         except gp.GPhoto2Error as error:
             raise DeviceError(f"gphoto2 says [{error.code}] {error.string}") from error
         return f"{model} at {port}" if port.startswith("usb:") else f"something listens at {port}"
 
     def _find(self, ports: Any, abilities: Any) -> tuple[str, str]:
-        """Find the camera: its model's name and its full port."""
+        """Load both lists and find the camera: its model's name and its full port."""
+        ports.load()
+        abilities.load()
         port = self._port
         if self._model:
             _check_model(self._model, abilities)

@@ -52,7 +52,8 @@ def map_figure(calibration: Calibration, at: AtFocal) -> Figure:
     depths = sample_depths(MAP_DEPTHS)
     errors = np.degrees(predicted_pointing(calibration, pixels[None], depths[:, None, None], nominal_px=at.nominal_px))
     limits = float(np.nanmin(errors)) * 0.99, float(np.nanmax(errors)) * 1.01
-    norm = (LogNorm if limits[1] > LOG_RATIO * limits[0] else Normalize)(*limits)
+    is_wide = limits[1] > LOG_RATIO * limits[0]
+    norm = (LogNorm if is_wide else Normalize)(*limits)
     levels = np.unique([float(digits(level)) for level in np.nanquantile(errors, CONTOUR_SHARES)])
     with styled(3.3) as figure:
         axes = figure.subplots(1, MAP_DEPTHS, sharey=True)
@@ -65,22 +66,12 @@ def map_figure(calibration: Calibration, at: AtFocal) -> Figure:
                 ax.clabel(lines, fontsize=7.5, fmt=digits)
             ax.set_title(f"{depth:.0f} m")
         bar = figure.colorbar(drawn, ax=axes, orientation="horizontal", shrink=0.75, aspect=45, pad=0.06)
-        ticks = _steps(*limits, TICKS)
+        ticks = (np.geomspace if is_wide else np.linspace)(*limits, TICKS)
         two_lines = [f"{digits(t)}°\n{digits(np.radians(t) * at.focal_px)} px" for t in ticks]
         bar.set_ticks(ticks.tolist(), labels=two_lines)
         bar.ax.minorticks_off()
         bar.set_label(f"predicted error, one standard deviation; px at a focal length of {at.focal_px:.0f} px")
         return figure
-
-
-def _steps(low: float, high: float, number: int) -> Array:
-    """Spread values between two others evenly, or over their logarithm where they are far apart."""
-    return (np.geomspace if high > LOG_RATIO * low else np.linspace)(low, high, number)
-
-
-def _pixels(focal_px: float) -> tuple[Any, Any]:
-    """Make the conversions from degrees to pixels and back at a focal length, for a second axis."""
-    return (lambda d: np.radians(d) * focal_px, lambda p: np.degrees(p / focal_px))
 
 
 def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) -> Figure:
@@ -102,7 +93,8 @@ def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) ->
             ax.plot(boards, np.zeros(len(boards)), "|", color=INK, ms=12, clip_on=False, label="boards")
         ax.set(xscale="log", xlabel="depth [m]", ylabel="predicted error [degrees]", xlim=(depths[0], depths[-1]))
         log_ticks(ax, [t for t in (1, 2, 5, 10, 20, 50, 100) if depths[0] <= t <= depths[-1]])
-        px = ax.secondary_yaxis("right", functions=_pixels(at.focal_px))
+        both_ways = (lambda degrees: np.radians(degrees) * at.focal_px, lambda px: np.degrees(px / at.focal_px))
+        px = ax.secondary_yaxis("right", functions=both_ways)
         px.set_ylabel(f"[px] at {at.focal_px:.0f} px")
         ax.legend(ncols=2, fontsize=8)
         return figure

@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from cotarget.config import RigConfig, SimCamera, split_name
-from cotarget.geometry import RigidTransform
 from cotarget.rig import Clock, Image, Rig
 from cotarget.sim.devices import (
     SimBoard,
@@ -91,7 +90,7 @@ class SimWorld:
             sim.zoom, effects, self._clock, partial(self.expose, "zoom"), self.lens_drive, spec.zoom.delay_s
         )
         head = SimPanTilt(spec.head, self._clock, self.head_drive)
-        board = SimBoard(self._place_board)
+        board = SimBoard(lambda T, swings: self._state.place_board(self._clock.now(), T, swings))
         self._of_world = (fixed, zoom, board)
         self._release = ExitStack()
         self._release.callback(self.close)
@@ -210,6 +209,3 @@ class SimWorld:
                     name,
                     FARTHEST,
                 )
-
-    def _place_board(self, T_fixed_board: RigidTransform | None, swings: bool) -> None:
-        self._state.place_board(self._clock.now(), T_fixed_board, swings)

@@ -27,10 +27,6 @@ SCATTER_SIGMA = 0.5  # standard deviation over the range of a kind's size: it is
 Stance = tuple[list[float], Axes, Mapping[str, float]]
 
 
-def _constant(target: "Target", t: float) -> float:
-    return target.phase
-
-
 @dataclass(frozen=True)
 class TargetKind:
     """One kind of target.
@@ -53,7 +49,7 @@ class TargetKind:
     stance: Callable[["Target", float, float], Stance]
     path: Callable[[str, np.random.Generator], Path] | None
     limbs: Callable[[float], Mapping[str, float]] = lambda beat: {}
-    beat: Callable[["Target", float], float] = _constant
+    beat: Callable[["Target", float], float] = lambda target, t: target.phase
     beat_s: float = 0.0
     scatter: float = 0.0
     marker: int | None = None
