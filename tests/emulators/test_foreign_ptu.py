@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from cotarget.emulators.ptu_d46.unit import E_SERIES, UnitProfile
+from cotarget.emulators.ptu_d46.unit import UnitProfile
 from tests.support.plants import LiveUnit
+from tests.support.units import E_SERIES
 
 pytestmark = [pytest.mark.foreign, pytest.mark.wire]
 SOURCE = Path(__file__).parents[1] / "data" / "mrpt_ptu.cpp"

@@ -13,11 +13,12 @@ import serial
 
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.ports import Wire
-from cotarget.emulators.ptu_d46.unit import D46_PAPER, D46_STOCK, E_SERIES, UnitProfile
+from cotarget.emulators.ptu_d46.unit import D46_PAPER, D46_STOCK, UnitProfile
 from cotarget.emulators.serve import Faults
 from cotarget.errors import ConfigError
 from tests.support.emulated_camera import DEADLINE_S
 from tests.support.plants import AxisModel, LiveUnit, wait_for
+from tests.support.units import E_SERIES
 
 STEP_S = 1e-3  # of simulated time
 LONG_S = 60.0  # of simulated time: more than a reset of the D46 takes
