@@ -29,8 +29,8 @@ from cotarget.rig import Frame, PanTiltLimits
 from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Aim, Reach, aim
-from cotarget.tracking.track import tracking_settings
-from cotarget.tracking.tracker import Tracker, update_tracks
+from cotarget.tracking.track import Track, tracking_settings
+from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film
 from experiments.engine import Count, Row, Settings
 
@@ -66,6 +66,7 @@ class Pipeline:
         """Start a detector of a kind without history, for images of a size [px]."""
         self.target: TargetProfile = replace(DEFAULT_TARGETS["bird"], detector=kind)
         self.detector: Detector = make_detector(self.target, rate_hz)
+        self.tracks: list[Track] = []
         self.calibration = calibration_of(size)
         self.tracker, self.policy = Tracker(tracking_settings(self.target), size), FirstCome()
         self.fusion = TargetFusion(self.calibration, self.target, size)
@@ -78,11 +79,11 @@ class Pipeline:
     def __call__(self, frame: Frame) -> Row:
         """Process a frame; give the milliseconds of each stage, and whether there was a target to aim at."""
         began = time.perf_counter()
-        detections = self.detector.detect(frame)
+        found = self.detector.detect(frame, self.tracks)
         detected = time.perf_counter()
-        tracks = update_tracks(self.tracker, detections, frame.t, self.detector)
-        self.fusion.update_fixed(frame, tracks, self.detector.mask)
-        number = self.policy.select(self.fusion.candidates(tracks, frame.t), np.zeros(2), self.limits)
+        self.tracks = self.tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
+        self.fusion.update_fixed(frame, self.tracks, found.mask)
+        number = self.policy.select(self.fusion.candidates(self.tracks, frame.t), np.zeros(2), self.limits)
         self.fusion.follow(number)
         estimate = None if number is None else self.fusion.estimate(number, frame.t + LEAD_S)
         tracked = time.perf_counter()

@@ -49,8 +49,10 @@ def rendered(settings: SweepSpeedSettings, number: int) -> list[Row]:
         while t is None or t < settings.seconds:
             frame = rig.fixed.read(newer_than=t)
             t = frame.t
-            shown, found = rig.zoom.read(), detector.detect(frame)
-            rows.append({"t": t, "grey": float(shown.image.mean()), "u": sum(float(one.center_px[0]) for one in found)})
+            shown, found = rig.zoom.read(), detector.detect(frame).boxes
+            rows.append(
+                {"t": t, "grey": float(shown.image.mean()), "u": sum(float(one.center_px[0]) for one in found.boxes)}
+            )
     return rows
 
 

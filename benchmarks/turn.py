@@ -34,7 +34,6 @@ PERCENTILES = (50, 95, 99)
 PARTS: Mapping[str, tuple[tuple[type, str], ...]] = {
     "detect": (
         (AutoDetector, "detect"),
-        (AutoDetector, "hold"),
         (BackgroundDetector, "detect"),
         (SmallTargetDetector, "detect"),
     ),

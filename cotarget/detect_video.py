@@ -19,6 +19,7 @@ from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile, check_writable
 from cotarget.geometry import Array
 from cotarget.parallel import Progress
+from cotarget.pipeline import CameraRun
 from cotarget.rig import Image
 from cotarget.track_metrics import (
     LEARNING_FRAMES,
@@ -33,7 +34,7 @@ from cotarget.track_metrics import (
     score_tracks,
 )
 from cotarget.tracking.track import Track, tracking_settings
-from cotarget.tracking.tracker import Tracker, update_tracks
+from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film, FilmWriter
 
 COLUMNS = ("frame", "t", "track", "u_px", "v_px", "width_px", "height_px", "score")
@@ -107,15 +108,14 @@ def _run(
     write_image: Callable[[Image, float], None] | None,
     progress: Progress | None,
 ) -> FilmSummary:
-    detector = make_detector(target, film.rate_hz)
-    tracker = Tracker(tracking_settings(target), film.size)
+    camera = CameraRun(make_detector(target, film.rate_hz), Tracker(tracking_settings(target), film.size))
     trails = Trails()
     numbers: set[int] = set()
     times = []
     with_target = 0
     for frame in film:
-        tracks = update_tracks(tracker, detector.detect(frame), frame.t, detector)
-        tracks = [track for track in tracks if track.confirmed]
+        camera.update(frame)
+        tracks = [track for track in camera.tracks if track.confirmed]
         for track in tracks:
             write_row(_row(film.number, frame.t, track))
         numbers.update(track.id for track in tracks)

@@ -16,7 +16,7 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import TargetProfile, split_name
-from cotarget.detection import Detection
+from cotarget.detection import Detection, Detections
 from cotarget.errors import ConfigError, UnreachableError
 from cotarget.estimation.motion_model import GATE
 from cotarget.estimation.zoom_matching import CloseupFinder, Expected, ZoomMeasurement
@@ -112,8 +112,6 @@ class TruthDetector:
     The detections of a frame depend on the seed and the frame's time alone. Occlusion is not considered.
     """
 
-    mask: Image | None = None
-
     def __init__(
         self,
         truth: Appearances,
@@ -126,7 +124,7 @@ class TruthDetector:
         self._truth, self._noise, self._numbers_at = truth, noise, counted(seed)
         self._names = tuple(truth.targets)
 
-    def detect(self, frame: Frame) -> list[Detection]:
+    def detect(self, frame: Frame, held: object = ()) -> Detections:
         """Detect the targets, largest first."""
         noise, size = self._noise, self._truth.lens(self._camera, frame.t).size
         rng = self._numbers_at(frame.t)
@@ -148,7 +146,7 @@ class TruthDetector:
             if min(sides) <= 0 or max(sides) < noise.smallest_px:
                 continue
             found.append(Detection(np.array(middle), np.array(sides), 1.0, clipped))
-        return sorted(found, key=lambda detection: -math.prod(detection.size_px.tolist()))
+        return Detections(sorted(found, key=lambda detection: -math.prod(detection.size_px.tolist())))
 
 
 class TruthFinder:

@@ -18,15 +18,14 @@ from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.control.selection import Candidate, leaves_in
 from cotarget.control.zoom import is_seen_well, shape_of
-from cotarget.detection import Detection
 from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
 from cotarget.estimation.motion_model import GATE, HEAD_SIGMA
 from cotarget.estimation.target_filter import inflated
 from cotarget.estimation.zoom_matching import CloseupFinder, Expected, Finder, MatchingSettings, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.pantilt import towards
-from cotarget.rig import Frame, Image, PanTiltState, ZoomState
-from cotarget.tracking.track import LARGEST_AREA_RATIO, Measurement, Track, missing, room_inside
+from cotarget.rig import Detection, Frame, Image, PanTiltState, ZoomState
+from cotarget.tracking.track import LARGEST_AREA_RATIO, Track, missing, room_inside
 
 REMEMBERED_S = 2.0  # longer than any latency [s]
 # States for the cubic interpolation: two before a time and two after it. A straight line through the nearest two is
@@ -130,7 +129,7 @@ class FixedMeasurement:
         size_px: size of the known dimension [px], if it is better known than from this box alone.
     """
 
-    box: Measurement
+    box: Detection
     sigma_px: Array | None = None
     size_px: float | None = None
 
@@ -147,7 +146,7 @@ def measure(track: Track, target: TargetProfile) -> FixedMeasurement:
         inside = Detection(track.center_px, np.zeros(2), track.score, clipped=True)
         return FixedMeasurement(inside, np.hypot(room_inside(box.size_px, track.size_px), track.size_px / 2))
     lacks = missing(track.size_px, box.size_px)
-    if lacks.any() and isinstance(box, Detection):  # a part of the target: no size, and a poor centre
+    if lacks.any():  # a part of the target: no size, and a poor centre
         return FixedMeasurement(replace(box, clipped=True), np.hypot(lacks, box.size_px) / 2)
     return FixedMeasurement(box, size_px=track.larger_side_px if target.largest_over_time else None)
 
@@ -323,7 +322,7 @@ class TargetFusion:
             if self._was_part(track):
                 self._filters[track.id] = self._make_filter()
             measured = measure(track, self._target)
-            if track.id == self._followed and measured.is_whole and isinstance(measured.box, Detection):
+            if track.id == self._followed and measured.is_whole:
                 fixed_view = self.search.finder.update_fixed(frame, measured.box, mask)
                 if fixed_view is not None:  # the same body point that the zoom image measures
                     body = replace(measured.box, center_px=fixed_view.body_px)

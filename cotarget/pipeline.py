@@ -22,7 +22,7 @@ from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome, TargetSelector
 from cotarget.control.zoom import ZoomSettings, shape_of
-from cotarget.detection import Detection, Detector, make_detector
+from cotarget.detection import Detection, Detections, Detector, make_detector
 from cotarget.detection.base import flood
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices
 from cotarget.estimation import Estimate, FilterSettings
@@ -43,7 +43,7 @@ from cotarget.rig import (
 )
 from cotarget.targeting import Aim, target_implausibility
 from cotarget.tracking.track import Track, TrackingSettings, tracking_settings
-from cotarget.tracking.tracker import Tracker, update_tracks
+from cotarget.tracking.tracker import Tracker
 
 # Longest wait for a zoom frame, except for the first, and pause after a fixed frame that repeats or jumps in time [s].
 WAIT_S = 2e-3
@@ -185,6 +185,25 @@ def _check_size(frame: Frame, camera: Camera, name: str) -> None:
             f"the {name} camera gave a frame of {width}x{height}, and not of {was_width}x{was_height}: set it back, or "
             "open the rig again"
         )
+
+
+class CameraRun:
+    """Detect and track in one camera's frames.
+
+    Attributes:
+        tracks: tracks after the last frame; confirmed ones first, then by age.
+    """
+
+    def __init__(self, detector: Detector, tracker: Tracker) -> None:
+        """Start without tracks."""
+        self._detector, self._tracker = detector, tracker
+        self.tracks: list[Track] = []
+
+    def update(self, frame: Frame) -> Detections:
+        """Detect the targets of a frame, which hold the tracks of the last one, and update the tracks."""
+        found = self._detector.detect(frame, self.tracks)
+        self.tracks = self._tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
+        return found
 
 
 class State(enum.StrEnum):
@@ -381,8 +400,8 @@ class _Run:
         selector: TargetSelector,
         settings: FollowSettings,
     ) -> None:
-        self._rig, self._detector, self._settings = rig, detector, settings
-        self._tracker = Tracker(settings.tracking or tracking_settings(target), rig.fixed.size)
+        self._rig, self._settings = rig, settings
+        self._camera = CameraRun(detector, Tracker(settings.tracking or tracking_settings(target), rig.fixed.size))
         self._fusion = TargetFusion(
             calibration,
             target,
@@ -406,12 +425,13 @@ class _Run:
         """Process one frame of the fixed camera, in the order of the paper's Table 1."""
         frame = self._frames.read_fixed()
         interval = min(self._frames.interval, LONGEST_INTERVAL_S)
-        detections = self._detector.detect(frame)
-        tracks = update_tracks(self._tracker, detections, frame.t, self._detector)
-        self._mask = self._detector.mask  # made anew at each access
-        zoom, found = self._estimate(frame, tracks)
+        detections = self._camera.update(frame)
+        tracks = self._camera.tracks
+        zoom, found = self._estimate(frame, tracks, detections.mask)
         followed = self._select(tracks)
-        outcome = self._search(tracks) if followed is None else self._follow(followed, frame.t, interval)
+        outcome = (
+            self._search(tracks, detections.mask) if followed is None else self._follow(followed, frame.t, interval)
+        )
         self._read_states()
         estimate = None if followed is None else self._fusion.estimate(followed.id, frame.t)
         warnings = [] if followed is None else self._fusion.warnings(followed.id, estimate)
@@ -423,8 +443,8 @@ class _Run:
             reason=_joined([*outcome.reasons, *warnings, *self._frames.faults()]),
             fixed=frame,
             zoom=zoom,
-            mask=self._mask,
-            detections=tuple(detections),
+            mask=detections.mask,
+            detections=tuple(detections.boxes),
             tracks=tuple(tracks),
             target=followed,
             aim=outcome.aim,
@@ -438,10 +458,10 @@ class _Run:
             skipped=self._skipped(),
         )
 
-    def _estimate(self, frame: Frame, tracks: list[Track]) -> tuple[Frame, ZoomMeasurement | None]:
+    def _estimate(self, frame: Frame, tracks: list[Track], mask: Image | None) -> tuple[Frame, ZoomMeasurement | None]:
         """Update the 3D estimates with both cameras' newest frames; return the zoom frame and what it measured."""
         favoured = {track.id for track in tracks if self._selector.favours(track)}
-        self._fusion.update_fixed(frame, tracks, self._mask, favoured)
+        self._fusion.update_fixed(frame, tracks, mask, favoured)
         self._read_states()
         zoom = self._frames.read_zoom()
         return zoom, self._fusion.update_zoom(zoom if self._frames.zoom_is_new else None, frame.t)
@@ -471,14 +491,14 @@ class _Run:
         self._fusion.follow(number)
         return next((track for track in tracks if track.id == number), None)
 
-    def _search(self, tracks: list[Track]) -> _Outcome:
+    def _search(self, tracks: list[Track], mask: Image | None) -> _Outcome:
         """Zoom out while no track is followed, and explain why none is."""
         self._controller.zoom_out()
         if unmet := self._selector.unmet:
             return _Outcome(State.SEARCHING, (unmet,))
         if tracks:
             return _Outcome(State.SEARCHING, ("what is detected is not confirmed yet",))
-        part = flood(self._mask)
+        part = flood(mask)
         why = part and f": {part:.0%} of the fixed image changed at once, as when the light does or the camera moves"
         return _Outcome(State.SEARCHING, (f"nothing is detected{why or ''}",))
 

@@ -1,4 +1,4 @@
-"""Define the rig that the pipeline sees: frames, device states, limits, and the Protocols of the devices.
+"""Define the rig that the pipeline sees: frames, detections, device states, limits, and the Protocols of the devices.
 
 A rig is the MuJoCo simulation, real devices, or a recording; the pipeline cannot distinguish them. Every blocking call
 advances the rig's own clock, which is simulated time in the simulation.
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.errors import ConfigError, DeviceError
-from cotarget.geometry import RigidTransform
+from cotarget.geometry import Array, RigidTransform
 
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
@@ -43,6 +43,23 @@ class Frame:
     image: Image
     t: float
     repeated: bool = False
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One target detected in one frame.
+
+    Attributes:
+        center_px: centre of the box (u, v), (2,).
+        size_px: width and height of the box, (2,).
+        score: confidence of the detector, 0 to 1.
+        clipped: whether the image's border cuts the box, so that its size is only a lower bound.
+    """
+
+    center_px: Array
+    size_px: Array
+    score: float
+    clipped: bool = False
 
 
 @dataclass(frozen=True)

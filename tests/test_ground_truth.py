@@ -26,9 +26,9 @@ def test_the_truth_detector_has_the_errors_of_its_noise():
         offs, sides, missed = [], [], 0
         for t in TIMES:
             low, high = truth.box("bird", "fixed", t)
-            found = detector.detect(Frame(image, t))
+            found = detector.detect(Frame(image, t)).boxes
             if t < 2:
-                later = again.detect(Frame(image, t))  # whatever was asked before
+                later = again.detect(Frame(image, t)).boxes  # whatever was asked before
                 assert [d.center_px.tolist() for d in later] == [d.center_px.tolist() for d in found]
             if not found:
                 missed += 1
@@ -40,7 +40,7 @@ def test_the_truth_detector_has_the_errors_of_its_noise():
         assert missed / len(TIMES) == pytest.approx(0.2, abs=0.06)  # the standard deviation over 500 frames is 2 %
         assert np.std(offs, axis=0) == pytest.approx([0.7, 0.7], rel=0.15)
         assert np.std(sides, axis=0) == pytest.approx([0.1, 0.1], rel=0.15)
-        exact = TruthDetector(truth, 5, TruthNoise(0.0, 0.0, 0.0)).detect(Frame(image, 1.0))[0]
+        exact = TruthDetector(truth, 5, TruthNoise(0.0, 0.0, 0.0)).detect(Frame(image, 1.0)).boxes[0]
         low, high = truth.box("bird", "fixed", 1.0)
         assert exact.center_px == pytest.approx((low + high) / 2)
         assert exact.size_px == pytest.approx(high - low)
@@ -50,8 +50,8 @@ def test_the_truth_detector_clips_boxes_at_the_border():
     with (w := SimWorld(five_targets_config(0), rendered=())).rig:
         detector = TruthDetector(w.truth(), 0, TruthNoise(0.0, 0.0, 0.0))
         image = np.zeros((480, 640, 3), np.uint8)
-        assert detector.detect(Frame(image, 0.0)) == []  # no target is there yet
-        found = [d for t in TIMES[::5] for d in detector.detect(Frame(image, t))]
+        assert detector.detect(Frame(image, 0.0)).boxes == []  # no target is there yet
+        found = [d for t in TIMES[::5] for d in detector.detect(Frame(image, t)).boxes]
         assert any(d.clipped for d in found)
         for d in found:
             assert (d.center_px - d.size_px / 2 >= -0.5 - 1e-9).all()
@@ -91,7 +91,7 @@ def test_a_finder_errs_independently_of_a_detector_of_its_seed():
         frame = Frame(np.zeros((480, 640, 3), np.uint8), 1.0)
         found = np.array([each.find(frame, expected).center_px for each in finders])
         noise = TruthNoise(center_px=1.0, size=0.0, miss=0.0)
-        detected = np.array([TruthDetector(truth, seed, noise).detect(frame)[0].center_px for seed in range(200)])
+        detected = np.array([TruthDetector(truth, seed, noise).detect(frame).boxes[0].center_px for seed in range(200)])
         assert np.abs(np.corrcoef(found.T, detected.T)[:2, 2:]).max() < ALIKE
 
 

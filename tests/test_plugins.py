@@ -184,7 +184,7 @@ def test_commands_and_doctor_use_own_devices(rig, capsys, monkeypatch):
 def test_own_detector_beside_rig_toml_is_found(rig, monkeypatch):
     monkeypatch.chdir("/")
     detector = make_detector(load_config(rig).target("wall"), 25.0)
-    [found] = detector.detect(Frame(np.full((48, 64, 3), 9, np.uint8), 0.0))
+    [found] = detector.detect(Frame(np.full((48, 64, 3), 9, np.uint8), 0.0)).boxes
     assert found.size_px.tolist() == [4.0, 5.0]
     with pytest.raises(CotargetError, match=r"^detector '.*devices\.py:boxes': .*devices\.py:\d+: KeyError: 'dark'$"):
         detector.detect(Frame(np.zeros((48, 64, 3), np.uint8), 0.0))

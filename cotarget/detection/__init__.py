@@ -13,12 +13,13 @@ import numpy as np
 from cotarget.config import TargetProfile
 from cotarget.detection.auto import AutoDetector
 from cotarget.detection.background import BIRD, GENERAL, PERSON, BackgroundDetector, BackgroundSettings, plain
-from cotarget.detection.base import Detection, Detector, ExternalDetector
+from cotarget.detection.base import Detections, Detector, ExternalDetector
 from cotarget.detection.color_template import ColorTemplateDetector
 from cotarget.detection.network import Network
 from cotarget.detection.small_target import SmallTargetDetector
 from cotarget.errors import ConfigError
 from cotarget.plugins import is_own, load, reporting
+from cotarget.rig import Detection
 
 __all__ = [
     "BIRD",
@@ -29,6 +30,7 @@ __all__ = [
     "BackgroundSettings",
     "ColorTemplateDetector",
     "Detection",
+    "Detections",
     "Detector",
     "ExternalDetector",
     "SmallTargetDetector",

@@ -13,6 +13,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -20,10 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.detection.background import LARGE, PERSON, BackgroundDetector
-from cotarget.detection.base import Detection
-from cotarget.detection.small_target import WEIGHTS, SmallTargetDetector, Weights
+from cotarget.detection.base import Detections
+from cotarget.detection.small_target import WEIGHTS, SmallTarget, SmallTargetDetector, Weights
 from cotarget.geometry import Array, intersection_areas
-from cotarget.rig import Frame, Image
+from cotarget.rig import Detection, Frame, Image
 
 if TYPE_CHECKING:
     from cotarget.tracking.track import Track
@@ -77,58 +78,45 @@ class AutoDetector:
         upright = shape is not None and shape < LARGE.wide
         self._large = BackgroundDetector(replace(LARGE, flat=PERSON.flat) if upright else LARGE, rate_hz)
         self._clutter = Clutter()
-        self._width = 0
-        self._steady = False  # whether large targets were searched in the last image
         self._apart: list[Detection] = []  # small targets that are no part of a large one, best first
+        self._background: Detections | None = None  # what the background model found last
         self._begun = np.zeros(2)  # the camera's shift when the background was begun [px]
         self._shifts: deque[tuple[float, Array]] = deque()  # the camera's shift in the last frames [px]
         self._moved: dict[int, tuple[float, Array]] = {}  # when a track last moved by its size, and where to
         self._tracks: list[Track] = []  # confirmed tracks
         self._held: list[tuple[Array, Array]] = []  # centre and size of each place whose background is not learnt
 
-    @property
-    def mask(self) -> Image | None:
-        """Foreground of the background model, and boxes of small targets elsewhere by their score, (H, W), 0 to 255."""
-        large = self._large.mask if self._steady else None
-        if large is None:
-            return self._small.mask
-        boxes = np.zeros_like(large)
-        for each in reversed(self._apart):
-            first = np.rint(each.center_px - (each.size_px - 1) / 2).astype(int)
-            last = np.rint(each.center_px + (each.size_px - 1) / 2).astype(int)
-            cv2.rectangle(boxes, first.tolist(), last.tolist(), round(255 * each.score), cv2.FILLED)
-        return np.asarray(cv2.max(boxes, large), dtype=np.uint8)
-
-    @property
-    def shift(self) -> Array:
-        """Shift of the scene in the last image since the first (du, dv) [px], (2,)."""
-        return self._small.shift
-
-    @property
-    def cut(self) -> bool:
-        """Whether the last image shows another scene than the one before."""
-        return self._small.camera.jumped
-
-    def detect(self, frame: Frame) -> list[Detection]:
-        """Detect the targets, best first; none in a frame that repeats the last one.
+    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+        """Detect the targets; none in a frame that repeats the last one.
 
         Raises:
             CotargetError: the image's size changed.
         """
-        targets = self._small.find(frame)
-        width = self._width = frame.image.shape[1]
-        self._steady = self._register(frame.t, width)
-        if self._small.repeated:  # it shows no target, and says nothing of where they usually are
-            return []
-        small = self._clutter.weigh([detection for _, detection in targets], frame.t, width, self._held)
-        if not self._steady:
-            return self._by_shape(small)
-        self._large.held = self._held
-        large = [replace(each, score=LARGE_SCORE) for each in self._large.detect(frame)]
-        outlined = [target.beside <= PLAIN for target, _ in targets]
-        large = [each for each in large if each.size_px.max() >= LARGE_PART * width]
-        found = fuse(small, outlined, self._are_followed(small, frame.t), large)
-        self._apart = [each for each in found if any(each is one for one in small)]
+        width = frame.image.shape[1]
+        self._hold(held, width)
+        targets, contrast = self._small.search(frame)
+        steady, shift_px = self._register(frame.t, width)
+        boxes: list[Detection] = []
+        if not self._small.repeated:  # a repeated frame says nothing of where targets usually are
+            boxes = self._boxes(frame, targets, contrast.boxes, shift_px if steady else None)
+        make_mask = contrast.make_mask
+        if steady and self._background is not None:
+            make_mask = partial(_mask, self._background, self._apart)
+        return Detections(boxes, make_mask, self._small.shift, self._small.camera.jumped)
+
+    def _boxes(
+        self, frame: Frame, targets: Sequence[SmallTarget], boxes: Sequence[Detection], shift_px: Array | None
+    ) -> list[Detection]:
+        """Weigh the small targets of a frame, and add the large ones if the background's shift is given, best first."""
+        width = frame.image.shape[1]
+        found = small = self._clutter.weigh(boxes, frame.t, width, self._held)
+        if shift_px is not None:
+            self._background = self._large.subtract(frame, self._held, shift_px)
+            large = [replace(each, score=LARGE_SCORE) for each in self._background.boxes]
+            outlined = [target.beside <= PLAIN for target in targets]
+            large = [each for each in large if each.size_px.max() >= LARGE_PART * width]
+            found = fuse(small, outlined, self._are_followed(small, frame.t, width), large)
+            self._apart = [each for each in found if any(each is one for one in small)]
         return self._by_shape(found)
 
     def _by_shape(self, found: Sequence[Detection]) -> list[Detection]:
@@ -137,8 +125,8 @@ class AutoDetector:
             found = [each if each.clipped else replace(each, score=by_shape(each, self._shape)) for each in found]
         return sorted(found, key=lambda each: -each.score)
 
-    def _register(self, t: float, width: int) -> bool:
-        """Give the background model the camera's shift; whether the camera has stood still for STEADY_S."""
+    def _register(self, t: float, width: int) -> tuple[bool, Array]:
+        """Whether the camera has stood still for STEADY_S, and the shift since the background was begun (2,) [px]."""
         shift, least = self._small.shift, SHAKE_PART * width
         self._shifts.append((t, shift))
         while not 0 <= t - self._shifts[0][0] <= STEADY_S:
@@ -149,12 +137,12 @@ class AutoDetector:
             self._large.forget()
             self._clutter.forget()
         # Less than a quarter of a pixel of the reduced image is no shift but noise.
-        self._large.shift = off if np.abs(off).max() > QUIET_PART * width else np.zeros(2)
-        return all(np.abs(shift - before).max() <= least for _, before in self._shifts)
+        off = off if np.abs(off).max() > QUIET_PART * width else np.zeros(2)
+        return all(np.abs(shift - before).max() <= least for _, before in self._shifts), off
 
-    def _are_followed(self, small: Sequence[Detection], t: float) -> list[bool]:
+    def _are_followed(self, small: Sequence[Detection], t: float, width: int) -> list[bool]:
         """Whether a confirmed track of its size, predicted at time ``t`` [s], follows each small target."""
-        margin = 2 * HELD_PART * self._width
+        margin = 2 * HELD_PART * width
         places = [
             (track.center_px + (t - track.t) * track.velocity_px, track.size_px + margin) for track in self._tracks
         ]
@@ -163,9 +151,9 @@ class AutoDetector:
         alike = np.abs(np.subtract.outer(*sides)) < np.log(SIDE_RATIO)
         return (near & alike).any(axis=1).tolist()
 
-    def hold(self, tracks: Sequence["Track"]) -> None:
-        """Do not learn the background under the confirmed ones of the last image's tracks, from the next image on."""
-        margin = HELD_PART * self._width
+    def _hold(self, tracks: Sequence["Track"], width: int) -> None:
+        """Do not learn the background under the confirmed ones of the last image's tracks."""
+        margin = HELD_PART * width
         moved: dict[int, tuple[float, Array]] = {}
         self._held = []
         self._tracks = [track for track in tracks if track.confirmed]
@@ -177,6 +165,17 @@ class AutoDetector:
             if track.t - since <= HELD_S:
                 self._held.append((track.center_px, (1 + 2 * HELD_MARGIN) * track.size_px + 2 * margin))
         self._moved = moved
+
+
+def _mask(background: Detections, apart: Sequence[Detection]) -> Image | None:
+    """Give the foreground of the background model, and boxes of small targets elsewhere by their score."""
+    large = background.mask
+    boxes = np.zeros_like(large)
+    for each in reversed(apart):
+        first = np.rint(each.center_px - (each.size_px - 1) / 2).astype(int)
+        last = np.rint(each.center_px + (each.size_px - 1) / 2).astype(int)
+        cv2.rectangle(boxes, first.tolist(), last.tolist(), round(255 * each.score), cv2.FILLED)
+    return np.asarray(cv2.max(boxes, large), dtype=np.uint8)
 
 
 class Clutter:

@@ -6,16 +6,22 @@ paper's settings. The reasons for the settings: docs/design-notes.md.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detection, box_detection, check_size, flood, is_clipped, moved
+from cotarget.detection.base import Detections, box_detection, check_size, flood, is_clipped, moved
 from cotarget.geometry import Array
-from cotarget.rig import Frame, Image
+from cotarget.rig import Detection, Frame, Image
+
+if TYPE_CHECKING:
+    from cotarget.tracking.track import Track
 
 # Values in MOG2's mask: 255 is foreground, 127 a shadow.
 FOREGROUND = 255
+STANDING = np.zeros(2)  # shift of the scene before a camera that stands [px]
 # Time for which foreground may fill the image, as after a change of light or a nudge, before the background is learnt
 # again [s]. The mixture alone would take as long as its history, and targets would not be seen meanwhile.
 FLOODED_S = 0.2
@@ -189,23 +195,24 @@ class BackgroundDetector:
         self._range: tuple[Image, Image] | None = None
         self._range_of: Image | None = None
         self._shape: tuple[int, ...] | None = None
-        self._foreground: Image | None = None
-        self.held: Sequence[tuple[Array, Array]] = ()  # centre and size of places whose background is not learnt [px]
-        self.shift: Array = np.zeros(2)  # of the camera since the background was begun, (du, dv) [px]
 
-    @property
-    def mask(self) -> Image | None:
-        """Foreground of the last frame, (H, W), 0 to 255."""
-        if self._foreground is None or self._shape is None or self._foreground.shape == self._shape[:2]:
-            return self._foreground
-        size = self._shape[1], self._shape[0]
-        return np.asarray(cv2.resize(self._foreground, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
-
-    def detect(self, frame: Frame) -> list[Detection]:
-        """Detect moving targets, largest first.
+    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+        """Detect moving targets, largest first; the background is learnt everywhere, as in the paper.
 
         Raises:
             CotargetError: the image's size changed.
+        """
+        return self.subtract(frame)
+
+    def subtract(
+        self, frame: Frame, places: Sequence[tuple[Array, Array]] = (), shift_px: Array = STANDING
+    ) -> Detections:
+        """Detect as `detect` does, also with a camera that moves a little.
+
+        Args:
+            frame: frame of the camera.
+            places: centre and size of places whose background is not learnt, (2,) each [px].
+            shift_px: shift of the scene since the background was begun (du, dv) [px], (2,).
         """
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
@@ -213,9 +220,9 @@ class BackgroundDetector:
         while self._settings.image_px and image.shape[1] > self._settings.image_px:
             image = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
             factor *= 2
-        shift = self.shift / factor
+        shift = shift_px / factor
         image = moved(image, -shift)
-        held = self._held_boxes(factor)
+        held = _reduced_boxes(places, shift_px, factor)
         mask = self._subtract(image, frame.t, held)
         if self._settings.shadows:
             mask = cv2.threshold(mask, FOREGROUND - 1, FOREGROUND, cv2.THRESH_BINARY)[1]
@@ -230,16 +237,16 @@ class BackgroundDetector:
         if shift.any():  # what has come into view is not known
             seen = _moved_mask(np.full(mask.shape, FOREGROUND, np.uint8), -shift)
             mask = np.asarray(cv2.bitwise_and(mask, cv2.compare(seen, FOREGROUND, cv2.CMP_EQ)), dtype=np.uint8)
-        self._foreground = _moved_mask(mask, shift)
+        make_mask = partial(_full_size, _moved_mask(mask, shift), frame.image.shape)
         if self._learnt < self._settings.warm_up_s:
-            return []
+            return Detections([], make_mask)
         if flood(mask):
             self._since = frame.t if self._since is None else self._since
             if frame.t - self._since >= FLOODED_S:
                 self.forget()
-            return []
+            return Detections([], make_mask)
         self._since = None
-        return [
+        boxes = [
             replace(
                 each,
                 center_px=factor * (each.center_px + shift) + (factor - 1) / 2,
@@ -250,17 +257,7 @@ class BackgroundDetector:
             for each in self._boxes(mask)
             if not self._settings.edged or self._has_edge(image, mask, _rows_and_columns(each))
         ]
-
-    def _held_boxes(self, factor: int) -> list[tuple[slice, slice]]:
-        """Give the parts of the reduced image whose background is not learnt."""
-        boxes = []
-        for center, size in self.held:
-            (left, top), (right, bottom) = (
-                np.maximum(np.rint((center - self.shift + sign * size / 2) / factor), 0).astype(int).tolist()
-                for sign in (-1, 1)
-            )
-            boxes.append((slice(top, bottom + 1), slice(left, right + 1)))
-        return boxes
+        return Detections(boxes, make_mask)
 
     def _subtract(self, image: Image, t: float, held: Sequence[tuple[slice, slice]]) -> Image:
         """Find the foreground at time ``t`` [s], and learn the background but for what is held."""
@@ -408,6 +405,25 @@ def _enlarged(box: tuple[slice, slice]) -> tuple[slice, slice]:
     """Enlarge a part of an image by EDGE_PX to each side, up to the image's border."""
     rows, columns = (slice(max(0, each.start - EDGE_PX), each.stop + EDGE_PX) for each in box)
     return rows, columns
+
+
+def _reduced_boxes(places: Sequence[tuple[Array, Array]], shift_px: Array, factor: int) -> list[tuple[slice, slice]]:
+    """Find the rows and columns of places, given by centre and size, in an image moved back and reduced."""
+    boxes = []
+    for center, size in places:
+        (left, top), (right, bottom) = (
+            np.maximum(np.rint((center - shift_px + sign * size / 2) / factor), 0).astype(int).tolist()
+            for sign in (-1, 1)
+        )
+        boxes.append((slice(top, bottom + 1), slice(left, right + 1)))
+    return boxes
+
+
+def _full_size(mask: Image, shape: tuple[int, ...]) -> Image:
+    """Enlarge a mask to an image of a shape (H, W, 3), if it is smaller."""
+    if mask.shape == shape[:2]:
+        return mask
+    return np.asarray(cv2.resize(mask, shape[1::-1], interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
 
 
 def _moved_mask(mask: Image, shift: Array) -> Image:

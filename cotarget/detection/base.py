@@ -9,46 +9,56 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from numbers import Number
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
 
 from cotarget.errors import CotargetError
 from cotarget.geometry import Array
-from cotarget.rig import Frame, Image
+from cotarget.rig import Detection, Frame, Image
+
+if TYPE_CHECKING:
+    from cotarget.tracking.track import Track
 
 # Largest part of foreground that may be targets; beyond it, the light or the camera has changed.
 MOST_FOREGROUND = 0.45
 
 
 @dataclass(frozen=True)
-class Detection:
-    """One target detected in one frame.
+class Detections:
+    """What a detector finds in one frame.
 
     Attributes:
-        center_px: centre of the box (u, v), (2,).
-        size_px: width and height of the box, (2,).
-        score: confidence of the detector, 0 to 1.
-        clipped: whether the image's border cuts the box, so that its size is only a lower bound.
+        boxes: the targets, best first.
+        make_mask: makes `mask`, which takes time and which few ask for.
+        shift: shift of the scene in this frame since the first (du, dv) [px], (2,); None if it is not measured.
+        cut: whether the frame shows another scene than the one before.
     """
 
-    center_px: Array
-    size_px: Array
-    score: float
-    clipped: bool = False
+    boxes: Sequence[Detection]
+    make_mask: Callable[[], Image | None] = lambda: None
+    shift: Array | None = None
+    cut: bool = False
+
+    @cached_property
+    def mask(self) -> Image | None:
+        """Foreground of the frame, (H, W), 0 to 255; None for a detector without one."""
+        return self.make_mask()
 
 
 class Detector(Protocol):
     """Detects targets of one kind in the frames of one camera."""
 
-    @property
-    def mask(self) -> Image | None:
-        """Foreground of the last frame, (H, W), 0 to 255."""
+    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+        """Detect the targets.
 
-    def detect(self, frame: Frame) -> list[Detection]:
-        """Detect the targets, best first; [] if there is none."""
+        Args:
+            frame: frame of the camera.
+            held: tracks after the last frame. A detector that learns the background does not learn the confirmed ones.
+        """
 
 
 def flood(mask: Image | None) -> float:
@@ -127,10 +137,9 @@ class ExternalDetector:
         """
         self._find = find
         self._shape: tuple[int, ...] | None = None
-        self.mask: Image | None = None
 
-    def detect(self, frame: Frame) -> list[Detection]:
-        """Detect what the function finds, best first; boxes are cut to the image.
+    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+        """Detect what the function finds; boxes are cut to the image.
 
         Raises:
             CotargetError: the image's size changed, or the function did not return boxes.
@@ -147,8 +156,7 @@ class ExternalDetector:
                 continue  # wholly outside the image
             clipped = bool((cut[0] <= 0).any() or (cut[1] >= size).any())
             found.append(Detection((cut[0] + cut[1] - 1) / 2, cut[1] - cut[0], score, clipped))
-        found.sort(key=lambda detection: -detection.score)
-        return found
+        return Detections(sorted(found, key=lambda detection: -detection.score))
 
 
 def _listed(boxes: Sequence[Box]) -> Iterable[Box]:

@@ -6,14 +6,19 @@ pose and the four of the brightness (the method of Lucas and Kanade, with a mode
 """
 
 import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detection, box_detection, check_size
+from cotarget.detection.base import Detections, box_detection, check_size
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
-from cotarget.rig import Frame, Image
+from cotarget.rig import Detection, Frame, Image
+
+if TYPE_CHECKING:
+    from cotarget.tracking.track import Track
 
 # Margin around a target's coarse box that is included [px]: blur and subsampled chroma reach about 3 px.
 MARGIN_PX = 4
@@ -173,10 +178,9 @@ class ColorTemplateDetector:
         tests = np.vstack([self._along, HUE_TANGENT * self._along - across, HUE_TANGENT * self._along + across])
         self._tests = tests * CHROMA_BYTE / strong
         self._shape: tuple[int, ...] | None = None
-        self.mask: Image | None = None
 
-    def detect(self, frame: Frame) -> list[Detection]:
-        """Detect targets of the template's colour and shape, best first.
+    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+        """Detect targets of the template's colour and shape.
 
         Raises:
             CotargetError: the image's size changed.
@@ -184,19 +188,20 @@ class ColorTemplateDetector:
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
         tests = cv2.transform(frame.image, self._tests)  # saturates at 0, so a wrong hue fails one of the last two
-        self.mask = cv2.inRange(tests, (LEAST_WEIGHT * CHROMA_BYTE, 1, 1), (255, 255, 255))
-        joined = cv2.dilate(self.mask, np.ones((3, 3), np.uint8))
+        mask = np.asarray(cv2.inRange(tests, (LEAST_WEIGHT * CHROMA_BYTE, 1, 1), (255, 255, 255)), dtype=np.uint8)
+        joined = cv2.dilate(mask, np.ones((3, 3), np.uint8))
         boxes = []
         for contour in cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
             x, y, w, h = cv2.boundingRect(contour)
-            inside = self.mask[y : y + h, x : x + w]
+            inside = mask[y : y + h, x : x + w]
             if cv2.countNonZero(inside) < LEAST_PIXELS:
                 continue
             dx, dy, w, h = cv2.boundingRect(inside)
-            if max(w / self.mask.shape[1], h / self.mask.shape[0]) <= LARGEST_COLOURED:
-                boxes.append(box_detection(x + dx, y + dy, w, h, 0.0, self.mask.shape))
+            if max(w / mask.shape[1], h / mask.shape[0]) <= LARGEST_COLOURED:
+                boxes.append(box_detection(x + dx, y + dy, w, h, 0.0, mask.shape))
         fitted = [self._refine(frame.image, box) for box in self._likeliest(tests[..., 0], boxes)]
-        return sorted((d for d in fitted if d is not None and d.score >= LEAST_FIT), key=lambda d: -d.score)
+        good = (each for each in fitted if each is not None and each.score >= LEAST_FIT)
+        return Detections(sorted(good, key=lambda each: -each.score), lambda: mask)
 
     def _likeliest(self, plane: Image, boxes: list[Detection]) -> list[Detection]:
         """Select at most MOST_FITTED boxes that look most like the template in the plane of its colour (H, W)."""

@@ -18,14 +18,18 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.detection.base import Detection, box_detection, check_size, is_clipped, moved
+from cotarget.detection.base import Detections, box_detection, check_size, is_clipped, moved
 from cotarget.geometry import Array
-from cotarget.rig import Frame, Image
+from cotarget.rig import Detection, Frame, Image
+
+if TYPE_CHECKING:
+    from cotarget.tracking.track import Track
 
 # Factor by which the image is reduced before corners are tracked; full size gives no better shift at twice the cost.
 SCALE = 2
@@ -710,21 +714,20 @@ class SmallTargetDetector:
         self._usual: Image | None = None  # mean difference from earlier images, float32
         self.shift: Array = np.zeros(2)  # of the camera since the first frame [px], (2,)
         self._shape: tuple[int, ...] | None = None
-        self.mask: Image | None = None
         self.repeated = False  # whether the last frame repeats the one before
 
-    def detect(self, frame: Frame) -> list[Detection]:
-        """Detect regions that stand out and change, the best first.
+    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+        """Detect regions that stand out and change.
 
         A frame that repeats the last one gives no detections.
 
         Raises:
             CotargetError: the image's size changed.
         """
-        return [detection for _, detection in self.find(frame)]
+        return self.search(frame)[1]
 
-    def find(self, frame: Frame) -> list[tuple[SmallTarget, Detection]]:
-        """Detect as `detect` does; also return the region of each detection, in the enlarged image of a small one."""
+    def search(self, frame: Frame) -> tuple[list[SmallTarget], Detections]:
+        """Detect as `detect` does; also return the region of each box, in the enlarged image of a small one."""
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
@@ -742,9 +745,8 @@ class SmallTargetDetector:
             self._warm_up_s = AFTER_CUT_S
         references = self._history.references(frame.t)
         self.repeated = not self._history.add(frame.t, grey, shift)
-        self.mask = np.zeros(frame.image.shape[:2], np.uint8)
         if self.repeated or self._history.span < self._warm_up_s:
-            return []
+            return [], Detections([], functools.partial(_mask, [], frame.image.shape, times))
         self._warm_up_s = WARM_UP_S
         shape = tuple(times * side for side in frame.image.shape[:2])
         found: list[tuple[SmallTarget, Detection]] = []
@@ -763,11 +765,10 @@ class SmallTargetDetector:
                 arrived.append((target, detection))
         differing = self._differing(grey, unit, times, shift, references)
         found = _best_of(found + [_as_a_whole(pair, arrived) for pair in differing])
-        for target, detection in reversed(found):
-            (x, y), (w, h) = target.low, target.size
-            rows, columns = slice(y // times, -(-(y + h) // times)), slice(x // times, -(-(x + w) // times))
-            self.mask[rows, columns] = round(255 * detection.score)
-        return found
+        boxes = [detection for _, detection in found]
+        return [target for target, _ in found], Detections(
+            boxes, functools.partial(_mask, found, frame.image.shape, times)
+        )
 
     def _differing(
         self, grey: Image, unit: int, times: int, shift: Array, references: list[tuple[Image, Array] | None]
@@ -831,6 +832,16 @@ def _enlarged(grey: Image) -> tuple[Image, int]:
         return grey, times
     enlarged = cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
     return np.asarray(enlarged, dtype=np.uint8), times
+
+
+def _mask(found: Sequence[tuple[SmallTarget, Detection]], shape: tuple[int, ...], times: int) -> Image:
+    """Draw regions of an image enlarged by a factor ``times`` into one of a shape (H, W, 3), by their scores."""
+    mask = np.zeros(shape[:2], np.uint8)
+    for target, detection in reversed(found):
+        (x, y), (w, h) = target.low, target.size
+        rows, columns = slice(y // times, -(-(y + h) // times)), slice(x // times, -(-(x + w) // times))
+        mask[rows, columns] = round(255 * detection.score)
+    return mask
 
 
 def _boxed(target: SmallTarget, score: float, shape: tuple[int, ...], times: int) -> Detection:

@@ -9,7 +9,6 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
-from cotarget.detection import Detection
 from cotarget.env.common import (
     DETECTOR_NOISE,
     IMAGE_SIZE,
@@ -144,8 +143,8 @@ class Follow(RigEnv[Any, Vector]):
 
     def _detect(self) -> None:
         """Detect and track in the newest frame of the fixed camera."""
-        self.detections: list[Detection] = self.episode.detector.detect(self.wide)
-        tracks = self._tracker.update(self.detections, self.wide.t)
+        self.detections = self.episode.detector.detect(self.wide)
+        tracks = self._tracker.update(self.detections.boxes, self.wide.t)
         self._track = tracks[0] if tracks and tracks[0].confirmed else None
 
     def _judge(self) -> Closeup:

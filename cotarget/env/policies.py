@@ -18,13 +18,13 @@ from scipy.optimize import brentq
 
 from cotarget.control.head import HeadCommand, HeadModel, axis_at
 from cotarget.control.selection import POLICIES
-from cotarget.detection import Detection
+from cotarget.detection import Detections
 from cotarget.env.common import Command, Episode, Vector, one_of
 from cotarget.env.follow import Follow
 from cotarget.env.schedule import Schedule
 from cotarget.errors import ConfigError
 from cotarget.pipeline import FollowSettings, Step, follow
-from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Speed
+from cotarget.rig import Frame, PanTiltLimits, PanTiltState, Speed
 from cotarget.safety.safe_rig import clipped
 
 NEAR = 1e-6  # tolerance of an angle [rad]
@@ -36,8 +36,6 @@ class EnvironmentRig:
     Attributes:
         rig: the rig; the environment owns its devices.
     """
-
-    mask: Image | None = None
 
     def __init__(self, env: Follow) -> None:
         """Wrap an environment that was reset.
@@ -52,7 +50,7 @@ class EnvironmentRig:
         self.rig = replace(rig, fixed=fixed, zoom=self._zoom, head=self._head, release=lambda: None)
         self._model = HeadModel(rig.head.limits)
 
-    def detect(self, frame: Frame) -> list[Detection]:
+    def detect(self, frame: Frame, held: object = ()) -> Detections:
         """Return the detections of the newest frame."""
         return self._env.detections
 

@@ -45,7 +45,7 @@ from cotarget.estimation.motion_model import (
     propagate,
 )
 from cotarget.geometry import Array
-from cotarget.tracking.track import Measurement
+from cotarget.rig import Detection
 
 
 @dataclass(frozen=True)
@@ -317,7 +317,7 @@ class TargetFilter:
         self._nodes: list[Node | None] = []  # state after each of them; None before the first in the fixed image
 
     def update_fixed(
-        self, detection: Measurement, t: float, *, sigma_px: Array | None = None, size_px: float | None = None
+        self, detection: Detection, t: float, *, sigma_px: Array | None = None, size_px: float | None = None
     ) -> bool:
         """Add a detection in the fixed image.
 

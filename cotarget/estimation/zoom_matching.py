@@ -16,11 +16,10 @@ import numpy.typing as npt
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
-from cotarget.detection import Detection
 from cotarget.estimation.correlation import Samples, correlate, resample, summit
 from cotarget.estimation.motion_model import GATE
 from cotarget.geometry import Array
-from cotarget.rig import Frame, Image
+from cotarget.rig import Detection, Frame, Image
 
 # Standard deviation of the body's centre along u and v, in parts of the box's sides, by the target profile's matcher;
 # None where the outline is not known. Measured on simulated targets.

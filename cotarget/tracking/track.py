@@ -11,12 +11,13 @@ import statistics
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.geometry import Array
+from cotarget.rig import Detection
 
 
 @dataclass(frozen=True)
@@ -253,26 +254,6 @@ CUT = 0.5
 PIECE = 0.7
 
 
-class Measurement(Protocol):
-    """What the tracker needs of a detection."""
-
-    @property
-    def center_px(self) -> Array:
-        """Centre of the box (u, v) [px], (2,)."""
-
-    @property
-    def size_px(self) -> Array:
-        """Width and height of the box [px], (2,)."""
-
-    @property
-    def score(self) -> float:
-        """Confidence of the detector, 0 to 1."""
-
-    @property
-    def clipped(self) -> bool:
-        """Whether the image's border cuts the box."""
-
-
 # Time for which a confirmed track is predicted after a cut of the film, or a blow at the camera [s].
 AFTER_CUT_S = 0.3
 # Width of the images for which the settings hold [px].
@@ -411,7 +392,7 @@ class Track:
     larger_side_px: float
     covariance: Array
     score: float
-    box: Measurement
+    box: Detection
     shared: bool = False
     seen_t: float = -math.inf
 
@@ -422,7 +403,7 @@ class LiveTrack:
     def __init__(
         self,
         number: int,
-        detection: Measurement,
+        detection: Detection,
         t: float,
         settings: TrackingSettings,
         image_size: tuple[int, int] | None = None,
@@ -480,7 +461,7 @@ class LiveTrack:
         if self._trail is not None:
             self._trail.move(by)
 
-    def correct(self, detection: Measurement) -> None:
+    def correct(self, detection: Detection) -> None:
         """Correct with a detection of this track alone."""
         weight = 1 - math.exp(-(self.t - self.seen) / self.settings.score_s)
         self.mean_score += weight * (detection.score - self.mean_score)
@@ -498,7 +479,7 @@ class LiveTrack:
             if self.confirmed:
                 self._trail = None
 
-    def correct_shared(self, detection: Measurement) -> None:
+    def correct_shared(self, detection: Detection) -> None:
         """Correct with a detection that covers other tracks too: this track is somewhere inside it."""
         room = room_inside(detection.size_px, self.size)
         inside = np.clip(self.center, detection.center_px - room, detection.center_px + room)
@@ -549,7 +530,7 @@ class LiveTrack:
             seen_t=self.seen,
         )
 
-    def variance(self, detection: Measurement) -> list[float]:
+    def variance(self, detection: Detection) -> list[float]:
         """Variances of a detection's centre along u and v [px^2]; in floats, which is faster."""
         part = CUT if detection.clipped else self.settings.noise_of_size
         sides = zip(self.size.tolist(), detection.size_px.tolist(), strict=True)
@@ -558,14 +539,14 @@ class LiveTrack:
             for usual, side in sides
         ]
 
-    def _add_box(self, detection: Measurement) -> None:
+    def _add_box(self, detection: Detection) -> None:
         """Add a box to the histories."""
         (u, v), (width, height) = detection.center_px.tolist(), detection.size_px.tolist()
         for history in (self._sizes, self._trail):
             if history is not None:
                 history.add(self.t, (u, v), (width, height), detection.clipped)
 
-    def _begin(self, detection: Measurement) -> list[AxisFilter]:
+    def _begin(self, detection: Detection) -> list[AxisFilter]:
         """Make filters that begin at a box, with the velocity of the edges in view since the first box.
 
         The centre of a target that comes into view is unknown, and that of its clipped box moves half as fast.
@@ -580,7 +561,7 @@ class LiveTrack:
                 axis.correct_velocity(statistics.fmean(ways) / dt, 2 * noise / dt**2)
         return axes
 
-    def _edges(self, detection: Measurement) -> list[Edges]:
+    def _edges(self, detection: Detection) -> list[Edges]:
         """Edges of a box along u and v, see `_edges`."""
         extents = self._image_size or (None, None)
         sides = zip(detection.center_px.tolist(), detection.size_px.tolist(), extents, strict=True)

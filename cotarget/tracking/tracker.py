@@ -6,17 +6,16 @@ Each track is filtered by `cotarget.tracking.track`. The source of the numbers: 
 
 import math
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from cotarget.geometry import Array, intersection_areas
+from cotarget.rig import Detection
 from cotarget.tracking.track import (
     CUT,
     LARGEST_AREA_RATIO,
     LiveTrack,
-    Measurement,
     Track,
     TrackingSettings,
     center_variance,
@@ -24,7 +23,7 @@ from cotarget.tracking.track import (
     tracking_settings,
 )
 
-__all__ = ["Measurement", "Track", "Tracker", "TrackingSettings", "tracking_settings"]
+__all__ = ["Track", "Tracker", "TrackingSettings", "tracking_settings"]
 # Cost of pairs that must not be matched; no assignment inside the gate reaches it.
 IMPOSSIBLE = 1e6
 # What lies to this part in a confirmed track's box, enlarged by a factor, belongs to it: a shoe, a rotor.
@@ -64,7 +63,7 @@ class Tracker:
         return sorted((s.track() for s in self._tracks), key=lambda track: (not track.confirmed, track.id))
 
     def update(
-        self, detections: Sequence[Measurement], t: float, shift: Array | None = None, *, cut: bool = False
+        self, detections: Sequence[Detection], t: float, shift: Array | None = None, *, cut: bool = False
     ) -> list[Track]:
         """Update the tracks with one frame's detections.
 
@@ -161,7 +160,7 @@ class Tracker:
         self._tracks = [state for state in self._tracks if state.number not in over]
         self._inside_since = inside_since
 
-    def _most_useful(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
+    def _most_useful(self, detections: Sequence[Detection]) -> Sequence[Detection]:
         """Select at most `most_detections` detections, in their order."""
         most = self._settings.most_detections
         if len(detections) <= most:
@@ -174,7 +173,7 @@ class Tracker:
             distance = np.where(explained, pairs.distance, np.inf).min(axis=0)
         return [detections[j] for j in sorted(np.argsort(distance, kind="stable")[:most].tolist())]
 
-    def _start_tracks(self, detections: Sequence[Measurement], t: float) -> None:
+    def _start_tracks(self, detections: Sequence[Detection], t: float) -> None:
         """Start a track at each detection that covers no existing one, but for much smaller ones just found."""
         if not detections:
             return
@@ -200,37 +199,6 @@ class Tracker:
                 self._next_id += 1
 
 
-@runtime_checkable
-class RegisteringDetector(Protocol):
-    """A detector that measures the camera's motion, and takes the confirmed tracks.
-
-    Attributes:
-        shift: shift of the scene in the last frame since the first (du, dv) [px], (2,).
-        cut: whether the last frame shows another scene than the one before.
-    """
-
-    @property
-    def shift(self) -> Array: ...
-
-    @property
-    def cut(self) -> bool: ...
-
-    def hold(self, tracks: Sequence[Track]) -> None:
-        """Take note of the last frame's tracks."""
-
-
-def update_tracks(tracker: Tracker, detections: Sequence[Measurement], t: float, detector: object) -> list[Track]:
-    """Update the tracks with what a detector found at time ``t`` [s]; give all tracks.
-
-    A `RegisteringDetector` gives the camera's motion, and takes the confirmed tracks.
-    """
-    if not isinstance(detector, RegisteringDetector):
-        return tracker.update(detections, t)
-    tracks = tracker.update(detections, t, detector.shift, cut=detector.cut)
-    detector.hold(tracks)
-    return tracks
-
-
 class _Pairs:
     """Comparison of every track with every detection, as arrays (tracks, detections).
 
@@ -247,7 +215,7 @@ class _Pairs:
     def __init__(
         self,
         states: Sequence[LiveTrack],
-        detections: Sequence[Measurement],
+        detections: Sequence[Detection],
         image_size: tuple[int, int] | None,
     ) -> None:
         """Compare tracks and detections, at least one of each; new objects need the image's (width, height) [px]."""
@@ -306,7 +274,7 @@ def _boxes_of(states: Sequence[LiveTrack]) -> tuple[Array, Array]:
     return np.array(at).reshape(-1, 2), np.array(size).reshape(-1, 2)
 
 
-def _boxes(detections: Sequence[Measurement]) -> tuple[Array, Array]:
+def _boxes(detections: Sequence[Detection]) -> tuple[Array, Array]:
     """Centres and sizes of detections [px], (n, 2) each."""
     center, size = [each.center_px for each in detections], [each.size_px for each in detections]
     return np.array(center).reshape(-1, 2), np.array(size).reshape(-1, 2)

@@ -22,13 +22,14 @@ from cotarget.detection import Detector, make_detector
 from cotarget.evaluation import off_target, on_target
 from cotarget.geometry import Array
 from cotarget.metrics import BACKGROUND_S, WHOLLY_VISIBLE, false_tracks, id_switches
+from cotarget.pipeline import CameraRun
 from cotarget.rig import Frame
 from cotarget.schema import NotNegative
 from cotarget.sim.targets.random_paths import GROUPED, SECONDS
 from cotarget.sim.truth import Silhouette
 from cotarget.sim.world import SimWorld
 from cotarget.tracking.track import tracking_settings
-from cotarget.tracking.tracker import Tracker, update_tracks
+from cotarget.tracking.tracker import Tracker
 from experiments.engine import Count, Row, Settings
 from experiments.following.field_scenes import field_config, five_targets_config
 from experiments.following.wide_view import WIDE
@@ -73,13 +74,13 @@ class Watch:
     found: list[bool] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._detector = self.detector or make_detector(self.target, self.config.sim.fixed.rate_hz)
-        self._tracker = Tracker(tracking_settings(self.target), self.config.sim.fixed.size)
+        detector = self.detector or make_detector(self.target, self.config.sim.fixed.rate_hz)
+        self._camera = CameraRun(detector, Tracker(tracking_settings(self.target), self.config.sim.fixed.size))
 
     def see(self, frame: Frame, shift: Array, outlines: Mapping[str, Silhouette | None]) -> None:
         """Search a frame with a shift (du, dv) [px], and judge the tracks."""
-        tracks = update_tracks(self._tracker, self._detector.detect(frame), frame.t, self._detector)
-        held = [dataclasses.replace(track, center_px=track.center_px - shift) for track in tracks]
+        self._camera.update(frame)
+        held = [dataclasses.replace(track, center_px=track.center_px - shift) for track in self._camera.tracks]
         if frame.t < BACKGROUND_S:
             return
         self.on.append(on_target(held, outlines))

@@ -21,10 +21,11 @@ from cotarget.detection import Detection, Detector, make_detector
 from cotarget.detection.background import pieces
 from cotarget.detection.base import box_detection
 from cotarget.files import read_table
+from cotarget.pipeline import CameraRun
 from cotarget.rig import Frame, Image
 from cotarget.track_metrics import Box, Criterion, Label, Tracked, read_labels, score_tracks
 from cotarget.tracking.track import tracking_settings
-from cotarget.tracking.tracker import RegisteringDetector, Tracker, update_tracks
+from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film
 from experiments.engine import Count, Row, Settings
 
@@ -178,12 +179,11 @@ def tracks_of(
     own = Tracker(usual, size)
     trackers = {least: Tracker(replace(usual, confirm_score=least), size) for least in scores}
     tracks: dict[float, list[Tracked]] = {least: [] for least in scores}
+    camera = CameraRun(detector, own)
     for index, frame in enumerate(frames):
-        found = detector.detect(frame)
-        shift, cut = (detector.shift, detector.cut) if isinstance(detector, RegisteringDetector) else (None, False)
-        update_tracks(own, found, frame.t, detector)
+        found = camera.update(frame)
         for least, tracker in trackers.items():
-            tracker.update(found, frame.t, shift, cut=cut)
+            tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
             tracks[least] += _confirmed(tracker, index, frame)
     return tracks
 

@@ -173,10 +173,11 @@ class _Shooter:
         """Process the next frame of the fixed camera."""
         self.frame = self._rig.fixed.read(newer_than=self._t)
         self._t = self.frame.t
-        tracks = self._tracker.update(self._detector.detect(self.frame), self.frame.t)
+        found = self._detector.detect(self.frame)
+        tracks = self._tracker.update(found.boxes, self.frame.t)
         state = self._rig.head.state()
         for fusion in self._fusions:
-            fusion.update_fixed(self.frame, tracks, self._detector.mask)
+            fusion.update_fixed(self.frame, tracks, found.mask)
             fusion.states.add(state, self._rig.zoom.state())
         candidates = self._fusions[0].candidates(tracks, self._rig.clock.now())
         number = self._policy.select(candidates, np.array([state.pan, state.tilt]), self._rig.head.limits)

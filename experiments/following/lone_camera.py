@@ -176,7 +176,7 @@ class LoneCamera:
             frame = self._rig.zoom.read(newer_than=last)
             interval = FIRST_INTERVAL_S if last is None else frame.t - last
             last = frame.t
-            found = [self._sighting(frame.t, each) for each in self._detector.detect(frame)]
+            found = [self._sighting(frame.t, each) for each in self._detector.detect(frame).boxes]
             doubted = self._take(frame.t, found)
             unseen = frame.t - self._course.seen_t
             if self._course.known and unseen <= COAST_S:

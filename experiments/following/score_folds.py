@@ -102,10 +102,10 @@ def examined(film: LabelledFilm) -> tuple[Array, Array]:
     """Give the evidence of each region examined in labelled frames, (n, 3), and whether it is on a label, (n,)."""
     detector, seen, on = SmallTargetDetector(0.0), list[Any](), list[bool]()
     for index, frame in enumerate(film.frames):
-        found = detector.find(frame)
+        targets, found = detector.search(frame)
         if index < LEARNING_FRAMES or not film.labels.get(index):
             continue
-        for target, detection in found:
+        for target, detection in zip(targets, found.boxes, strict=True):
             box = Box(detection.center_px, detection.size_px)
             if not target.since or detection.clipped or _is_on(box, film.flyers.get(index, ())):
                 continue

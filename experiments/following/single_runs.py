@@ -9,13 +9,13 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetProfile
-from cotarget.detection import Detection
+from cotarget.detection import Detections
 from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, closeup_of, counted, true_calibration
 from cotarget.metrics import BACKGROUND_S, ROUNDING_S, WHOLLY_VISIBLE
 from cotarget.metrics import Row as Judged
 from cotarget.pantilt import towards
 from cotarget.pipeline import FollowSettings, follow
-from cotarget.rig import Frame, Image, Rig
+from cotarget.rig import Frame, Rig
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.truth import Outlines, Truth
 from cotarget.sim.world import SimWorld
@@ -33,15 +33,13 @@ MOVED_PX, MOVED_S = 1.0, 0.02  # least shift of a moving image, within this time
 class Shaken:
     """Detector with true positions and noise, and more misses while the image moves."""
 
-    mask: Image | None = None
-
     def __init__(self, outlines: Outlines, truth: Truth, seed: int, miss: float) -> None:
         """Prepare the detectors at rest and in motion, where a fraction ``miss`` of the frames has no detection."""
         self._still = TruthDetector(outlines, seed, NOISE, camera="zoom")
         self._moving = TruthDetector(outlines, seed, replace(NOISE, miss=miss), camera="zoom")
         self._truth, self._miss, self._numbers_at = truth, miss, counted(seed + APART)
 
-    def detect(self, frame: Frame) -> list[Detection]:
+    def detect(self, frame: Frame, held: object = ()) -> Detections:
         """Detect the target."""
         return (self._moving if self.moves(frame.t) else self._still).detect(frame)
 

@@ -13,7 +13,7 @@ from tempfile import TemporaryFile
 import numpy as np
 
 from cotarget.config import RigConfig, TargetProfile
-from cotarget.detection import Detection, make_detector
+from cotarget.detection import Detection, Detections, make_detector
 from cotarget.evaluation import microseconds
 from cotarget.rig import Camera, Frame, Image
 from cotarget.sim.truth import CameraName
@@ -94,8 +94,8 @@ def record(config: RigConfig, target: TargetProfile, seconds: float) -> WideView
         t: float | None = None
         while t is None or t < seconds:
             frame = rig.fixed.read(newer_than=t)
-            t, found = frame.t, tuple(detector.detect(frame))
-            frames[microseconds(t)] = Seen(found, shelf.put(frame.image), shelf.put(detector.mask))
+            t, found = frame.t, detector.detect(frame)
+            frames[microseconds(t)] = Seen(tuple(found.boxes), shelf.put(frame.image), shelf.put(found.mask))
     return WideView(frames, pictures=True)
 
 
@@ -116,13 +116,11 @@ class RecordedDetector:
 
     def __init__(self, view: WideView) -> None:
         self._view = view
-        self.mask: Image | None = None
 
-    def detect(self, frame: Frame) -> list[Detection]:
+    def detect(self, frame: Frame, held: object = ()) -> Detections:
         """Give the recorded detections, best first."""
         seen = self._view.at(frame.t)
-        self.mask = None if seen.mask is None else seen.mask.image()
-        return list(seen.detections)
+        return Detections(seen.detections, lambda: None if seen.mask is None else seen.mask.image())
 
 
 class _RecordedCamera:

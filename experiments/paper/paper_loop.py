@@ -48,7 +48,7 @@ def follow_as_the_paper(
     while rig.clock.now() < end:
         frame = eyes.read_fixed()
         detections = detector.detect(frame)
-        tracks = tracker.update(detections, frame.t)
+        tracks = tracker.update(detections.boxes, frame.t)
         zoom = eyes.read_zoom()
         mine = _first(tracks, mine)
         head, lens, now, found = rig.head.state(), rig.zoom.state(), rig.clock.now(), None
@@ -64,8 +64,8 @@ def follow_as_the_paper(
             reason="",
             fixed=frame,
             zoom=zoom,
-            mask=detector.mask,
-            detections=tuple(detections),
+            mask=detections.mask,
+            detections=tuple(detections.boxes),
             tracks=tuple(tracks),
             target=mine,
             aim=found,

@@ -12,7 +12,7 @@ from typing import Any
 
 from cotarget.backends import open_rig
 from cotarget.config import RigConfig
-from cotarget.detection import Detection, make_detector
+from cotarget.detection import Detections, make_detector
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.pipeline import follow
 from cotarget.rig import Clock, Frame, Rig, Speed
@@ -77,11 +77,11 @@ class TimedHead(Noted):
 class TimedDetector(Noted):
     """Detector that records when a frame is searched."""
 
-    def detect(self, frame: Frame) -> list[Detection]:
+    def detect(self, frame: Frame, held: object = ()) -> Detections:
         """Run the detector."""
         turn, clock = self._notes.turns[-1], self._notes.clock
         turn.detecting = clock.now()
-        found: list[Detection] = self._device.detect(frame)
+        found: Detections = self._device.detect(frame, held)
         turn.detected = clock.now()
         return found
 

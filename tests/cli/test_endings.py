@@ -141,7 +141,7 @@ def test_interrupted_detect_keeps_the_tracks_so_far(folder, capsys, monkeypatch)
             film.write(ToyDevices().fixed.expose(index), index / 25)
     seen = []
 
-    def detect(self, frame, plain=Bright.detect):
+    def detect(self, frame, held=(), plain=Bright.detect):
         seen.append(frame.t)
         if len(seen) > FRAMES:
             raise KeyboardInterrupt

@@ -8,9 +8,10 @@ from cotarget.config import TargetProfile
 from cotarget.detection import AutoDetector, BackgroundDetector, Detection, make_detector
 from cotarget.detection.auto import Clutter, by_shape, fuse
 from cotarget.detection.background import LARGE
+from cotarget.pipeline import CameraRun
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
-from cotarget.tracking.tracker import Tracker, update_tracks
+from cotarget.tracking.tracker import Tracker
 from tests.support.noise import noisy
 
 NOISE = 2.0  # grey levels, as the simulated sensor's
@@ -37,12 +38,12 @@ def follow(pictures, rate, rng, detector=None):
     """Detect and track in pictures, with noise; the confirmed tracks of each frame."""
     detector = detector or make_detector(TARGET, rate)
     assert isinstance(detector, AutoDetector)
-    tracker, found = None, []
+    camera, found = None, []
     for i, picture in enumerate(pictures):
         image = noisy(picture, rng, NOISE)
-        tracker = tracker or Tracker(tracking_settings(TARGET), image.shape[1::-1])
-        tracks = update_tracks(tracker, detector.detect(Frame(image, i / rate)), i / rate, detector)
-        found.append([track for track in tracks if track.confirmed])
+        camera = camera or CameraRun(detector, Tracker(tracking_settings(TARGET), image.shape[1::-1]))
+        camera.update(Frame(image, i / rate))
+        found.append([track for track in camera.tracks if track.confirmed])
     return found
 
 
@@ -130,7 +131,7 @@ def test_a_large_target_before_a_plain_wall_is_not_taken_for_the_cameras_motion(
         if place and place[0] > width
     ]
     assert np.mean([bool(each) for each in right]) >= FOUND
-    assert np.abs(detector.shift).max() < 1
+    assert np.abs(detector.detect(Frame(wall[:, width:].astype(np.uint8), 100 / rate)).shift).max() < 1
 
 
 def test_a_target_that_grows_from_a_speck_keeps_its_number():
@@ -160,7 +161,7 @@ def test_a_bird_of_four_pixels_is_found_in_an_image_of_3840x2160():
         u, v = 800 + 11 * i, 700 + 5 * i
         picture[v : v + 4, u : u + 4] -= 20
         image = cv2.merge([np.clip(picture, 0, 255).astype(np.uint8)] * 3)
-        boxes = detector.detect(Frame(image, i / rate))
+        boxes = detector.detect(Frame(image, i / rate)).boxes
         found.append([each for each in boxes if np.linalg.norm(each.center_px - [u + 1.5, v + 1.5]) < 3])
     scored = found[8:]
     assert np.mean([bool(each) and each[0].score > 0.5 for each in scored]) >= 0.9
@@ -214,10 +215,10 @@ def test_the_foreground_of_a_large_target_has_its_outline_and_no_boxes_of_its_pa
         picture, u = background.copy(), 100 + 4 * i
         if i >= 10:
             picture[250:390, u : u + 60][body > 0] = surface[body > 0]
-        detector.detect(Frame(noisy(picture, rng, NOISE), i / rate))
+        mask = detector.detect(Frame(noisy(picture, rng, NOISE), i / rate)).mask
         if i >= 20:
-            beside.append(cv2.countNonZero(detector.mask[230:410, u - 20 : u + 80] * (1 - near)))
-            on_body.append(cv2.countNonZero(detector.mask[250:390, u : u + 60] * body))
+            beside.append(cv2.countNonZero(mask[230:410, u - 20 : u + 80] * (1 - near)))
+            on_body.append(cv2.countNonZero(mask[250:390, u : u + 60] * body))
     assert max(beside) < 0.01 * body.sum()
     assert np.mean(on_body) > 0.8 * body.sum()
 
@@ -249,7 +250,7 @@ def test_frames_that_come_twice_hide_no_clutter():
         for i in range(100):
             picture = background.astype(np.uint8)
             picture[100:106, 200:208] = (40, 220)[i // 3 % 2]
-            first, *_ = [detector.detect(Frame(picture, (i + k / times) / 25)) for k in range(times)]
+            first, *_ = [detector.detect(Frame(picture, (i + k / times) / 25)).boxes for k in range(times)]
             found.append(first)
         return [max((each.score for each in boxes), default=0.0) for boxes in found[50:]]
 
@@ -263,13 +264,13 @@ def test_a_person_is_found_as_soon_where_frames_come_twice():
 
     def first(times):
         """Time of the first confirmed track [s]."""
-        rng, detector, found = np.random.default_rng(2), make_detector(TARGET, 25.0 * times), []
-        tracker = Tracker(tracking_settings(TARGET), (640, 480))
+        rng, found = np.random.default_rng(2), []
+        camera = CameraRun(make_detector(TARGET, 25.0 * times), Tracker(tracking_settings(TARGET), (640, 480)))
         for i, picture in enumerate(moved(background, surface, places)):
             image = noisy(picture, rng, NOISE)
             for t in [(i + k / times) / 25 for k in range(times)]:
-                tracks = update_tracks(tracker, detector.detect(Frame(image, t)), t, detector)
-                found += [t] * any(each.confirmed for each in tracks)
+                camera.update(Frame(image, t))
+                found += [t] * any(each.confirmed for each in camera.tracks)
         return found[0]
 
     assert first(2) == pytest.approx(first(1), abs=0.1)
@@ -356,7 +357,7 @@ def test_a_dark_target_of_one_colour_is_found_before_a_textured_wall(size):
     places = [None] * 20 + [(100 + 4 * i, 200) for i in range(50)]
     for i, picture in enumerate(moved(wall, np.full((*size[::-1], 3), 30.0), places)):
         image = noisy(cv2.GaussianBlur(picture, (0, 0), 0.7), rng, NOISE)
-        boxes = detector.detect(Frame(image, i / rate))
+        boxes = detector.detect(Frame(image, i / rate)).boxes
         if i >= 26:
             middle = np.add(places[i], np.array(size) / 2 - 0.5)
             found.append(any(np.abs(each.center_px - middle).max() < 6 for each in boxes))
@@ -369,11 +370,11 @@ def test_a_box_at_the_images_border_is_clipped_wherever_the_camera_points(shift)
     detector = BackgroundDetector(LARGE, rate)
     background = scenery((480, 360), rng)
     for i in range(12):
-        detector.shift = np.array([0.0 if i < 10 else shift, 0.0])
-        picture = np.roll(background, round(detector.shift[0]), axis=1)
+        by = np.array([0.0 if i < 10 else shift, 0.0])
+        picture = np.roll(background, round(by[0]), axis=1)
         if i >= 10:
             picture[200:260, 440:] = texture(40, 60, rng)
-        boxes = detector.detect(Frame(noisy(picture, rng, NOISE), i / rate))
+        boxes = detector.subtract(Frame(noisy(picture, rng, NOISE), i / rate), shift_px=by).boxes
     assert [each.clipped for each in boxes if on([each], (459.5, 229.5), 12)] == [True]
 
 
@@ -382,34 +383,33 @@ def test_the_foreground_of_a_camera_that_pans_is_not_that_of_before():
     detector, background = AutoDetector(rate), scenery((900, 480), rng)
     for i, picture in enumerate(moved(background, texture(60, 80, rng), [None] * 10 + [(200, 200)] * 30)):
         left = max(0, 8 * (i - 20))
-        detector.detect(Frame(noisy(picture[:, left : left + 640], rng, NOISE), i / rate))
+        mask = detector.detect(Frame(noisy(picture[:, left : left + 640], rng, NOISE), i / rate)).mask
         if i == 19:
-            assert detector.mask[240, 230] == 255
+            assert mask[240, 230] == 255
     # The target is at another place now.
-    assert cv2.countNonZero(detector.mask[200:280, 200:260]) < 0.1 * 60 * 80
+    assert cv2.countNonZero(mask[200:280, 200:260]) < 0.1 * 60 * 80
 
 
 def test_what_the_image_shows_is_learnt_beside_places_that_are_held_outside_of_it():
     """A track near the border, and a camera that has been nudged: what the image shows is learnt."""
     rng, rate = np.random.default_rng(8), 5.0
     detector = BackgroundDetector(LARGE, rate)
-    detector.held = [(np.array([u, 130.0]), np.array([10.0, 60.0])) for u in (-300.0, 700.0)]
+    places = [(np.array([u, 130.0]), np.array([10.0, 60.0])) for u in (-300.0, 700.0)]
     pictures = list(moved(scenery((640, 480), rng), texture(40, 60, rng), [None] * 10 + [(320, 100)] * 200))
-    found = [detector.detect(Frame(picture.astype(np.uint8), i / rate)) for i, picture in enumerate(pictures)]
-    assert len(found[12]) == 1
-    assert not found[-1]
-    assert not detector.mask.any()
+    found = [detector.subtract(Frame(each.astype(np.uint8), i / rate), places) for i, each in enumerate(pictures)]
+    assert len(found[12].boxes) == 1
+    assert not found[-1].boxes
+    assert not found[-1].mask.any()
 
 
 def test_a_place_that_is_held_may_lie_outside_the_image():
     """A track near the border, and a camera that has been nudged."""
     rng, rate = np.random.default_rng(8), 25.0
     detector = BackgroundDetector(LARGE, rate)
-    detector.shift = np.array([5.0, 0.0])
-    detector.held = [(np.array([u, 100.0]), np.array([10.0, 10.0])) for u in (-300.0, 700.0)]
+    places = [(np.array([u, 100.0]), np.array([10.0, 10.0])) for u in (-300.0, 700.0)]
     picture = scenery((640, 480), rng)
     for i in range(20):
-        assert detector.detect(Frame(picture.astype(np.uint8), i / rate)) == []
+        assert not detector.subtract(Frame(picture.astype(np.uint8), i / rate), places, np.array([5.0, 0.0])).boxes
 
 
 @pytest.mark.parametrize(("size", "score"), [
@@ -451,7 +451,7 @@ def test_the_expected_shape_lowers_the_score_of_others_but_not_of_clipped_ones()
         detector = make_detector(TargetProfile(1.75, "height", 300.0, shape=shape), rate)
         places = [None] * 10 + [(20 + 8 * i, 100) for i in range(36)]
         for i, picture in enumerate(moved(background, surface, [each and (min(each[0], 260), 100) for each in places])):
-            found = detector.detect(Frame(noisy(picture, rng, NOISE), i / rate))
+            found = detector.detect(Frame(noisy(picture, rng, NOISE), i / rate)).boxes
             if i in (30, 45):
                 scores[shape, i] = max(((each.score, each.clipped) for each in found), default=None)
     assert not scores[None, 30][1]

@@ -69,7 +69,7 @@ def test_colour_is_located_to_a_fraction_of_a_pixel(turn_deg):
     errors = []
     for _ in range(60):
         center, size = rng.uniform((30, 25), (65, 45)), np.array(BOOK_PX) * rng.uniform(0.9, 1.2)
-        found = detector.detect(Frame(book_picture(center, size, np.radians(turn_deg), rng), 0.0))
+        found = detector.detect(Frame(book_picture(center, size, np.radians(turn_deg), rng), 0.0)).boxes
         assert len(found) == 1
         assert found[0].score > 0.8
         errors.append([*(found[0].center_px - center), *(found[0].size_px - size)])
@@ -99,7 +99,7 @@ def test_a_large_book_is_located_as_well_and_by_no_more_pixels(width, monkeypatc
         return fit_template(template, patch, center, size)
 
     monkeypatch.setattr(color_template, "fit_template", fit)
-    (found,) = ColorTemplateDetector(cover()).detect(Frame(on_a_wall((book_of(width), 107, 63)), 0.0))
+    (found,) = ColorTemplateDetector(cover()).detect(Frame(on_a_wall((book_of(width), 107, 63)), 0.0)).boxes
     height = width * 3 // 4
     np.testing.assert_allclose(found.center_px, (107 + (width - 1) / 2, 63 + (height - 1) / 2), atol=ACCURACY_PX)
     np.testing.assert_allclose(found.size_px, (width, height), atol=ACCURACY_PX)
@@ -108,7 +108,7 @@ def test_a_large_book_is_located_as_well_and_by_no_more_pixels(width, monkeypatc
 
 
 def test_a_large_book_at_the_border_is_located():
-    (found,) = ColorTemplateDetector(cover()).detect(Frame(on_a_wall((book_of(200), 440, 330)), 0.0))
+    (found,) = ColorTemplateDetector(cover()).detect(Frame(on_a_wall((book_of(200), 440, 330)), 0.0)).boxes
     assert found.clipped
     np.testing.assert_allclose(found.center_px, (440 + 199 / 2, 330 + 149 / 2), atol=1.0)
 
@@ -121,7 +121,7 @@ def test_among_a_hundred_red_things_the_book_is_found_by_a_few_fits(size, monkey
     red[:, : size // 4] = (60, 40, 150)
     things = [(red, 20 + 60 * (k % 10), 10 + 47 * (k // 10)) for k in range(100)]
     things[37] = (book_of(16), *things[37][1:])
-    best = ColorTemplateDetector(cover()).detect(Frame(on_a_wall(*things), 0.0))[0]
+    best = ColorTemplateDetector(cover()).detect(Frame(on_a_wall(*things), 0.0)).boxes[0]
     np.testing.assert_allclose(best.center_px, np.add(things[37][1:], (15 / 2, 11 / 2)), atol=ACCURACY_PX)
     assert len(fits) == MOST_FITTED
 
@@ -131,7 +131,7 @@ def test_another_colour_is_not_taken_for_the_target():
     image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     for k, other in enumerate([(190, 25, 35), (25, 190, 35), (20, 120, 160), (250, 250, 250), (0, 0, 0)]):
         image[30:42, 5 + 18 * k : 18 + 18 * k] = other
-    assert ColorTemplateDetector(cover()).detect(Frame(photograph(image, rng), 0.0)) == []
+    assert ColorTemplateDetector(cover()).detect(Frame(photograph(image, rng), 0.0)).boxes == []
 
 
 def test_a_grey_or_missing_template_is_refused(tmp_path):
@@ -157,7 +157,7 @@ def sky(rng, shape=(240, 320)):
 
 
 def watch(detector, pictures, rate=RATE):
-    return [detector.detect(Frame(picture, i / rate)) for i, picture in enumerate(pictures)]
+    return [detector.detect(Frame(picture, i / rate)).boxes for i, picture in enumerate(pictures)]
 
 
 def motion(name):
@@ -304,14 +304,14 @@ def test_light_that_changes_everywhere_is_no_target():
 def test_an_image_of_one_pixel_is_no_error(name):
     detector = make_detector(dataclasses.replace(DEFAULT_TARGETS["bird"], detector=name), 25.0)
     for i in range(20):
-        assert detector.detect(Frame(np.full((1, 1, 3), 12 * i, np.uint8), i / 25)) == []
+        assert detector.detect(Frame(np.full((1, 1, 3), 12 * i, np.uint8), i / 25)).boxes == []
 
 
 def test_times_that_repeat_or_jump_back_do_no_harm():
     rng = np.random.default_rng(8)
     detector = motion("bird")
     for t in (0.0, 0.0, 5.0, 1.0, 1.0, 1.04):
-        assert detector.detect(Frame(sky(rng), t)) == []
+        assert detector.detect(Frame(sky(rng), t)).boxes == []
 
 
 @pytest.mark.parametrize("name", ["bird", "person"])
@@ -337,9 +337,11 @@ def test_who_walks_is_seen_again_soon_after_the_whole_picture_has_changed(what):
         u = 20 + 2 * i
         picture[100:180, u : u + 26] = 20.0
         found = detector.detect(Frame(photograph(picture, rng), t))
-        there = [each for each in found if abs(each.center_px[0] - u - 12.5) < 6 and abs(each.center_px[1] - 139.5) < 6]
+        there = [
+            each for each in found.boxes if abs(each.center_px[0] - u - 12.5) < 6 and abs(each.center_px[1] - 139.5) < 6
+        ]
         seen.append(bool(there))
-        flooded.append(flood(detector.mask) > MOST_FOREGROUND)
+        flooded.append(flood(found.mask) > MOST_FOREGROUND)
     changed = round(at_s * RATE)
     assert all(seen[changed - 20 : changed])
     assert flooded == [changed <= i <= changed + FLOODED_S * RATE for i in range(len(flooded))]

@@ -11,7 +11,7 @@ FRAME = Frame(np.zeros((50, 80, 3), np.uint8), 0.0)
 
 
 def found(*boxes):
-    return ExternalDetector(lambda image: boxes).detect(FRAME)
+    return ExternalDetector(lambda image: boxes).detect(FRAME).boxes
 
 
 def test_boxes_become_detections_the_surest_first():
@@ -50,7 +50,7 @@ def test_arrays_of_no_boxes_are_refused_in_one_line(returned):
 
 @pytest.mark.parametrize("nothing", [[], (), np.zeros(0), np.zeros((0, 4)), iter(())])
 def test_nothing_found(nothing):
-    assert ExternalDetector(lambda image: nothing).detect(FRAME) == []
+    assert ExternalDetector(lambda image: nothing).detect(FRAME).boxes == []
 
 
 @pytest.mark.parametrize("box", [(1, 2, 3), (1, 2, 0, 4), (1, 2, 3, float("nan")), (1, 2, 3, 4, 1.5), "box", None])

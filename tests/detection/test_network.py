@@ -143,7 +143,9 @@ def test_boxes_of_every_layout_are_where_the_targets_are(tmp_path, layout, width
     targets = {
         name: 4 * np.rint(np.multiply(part, (width, height) * 2) / 4).astype(int) for name, part in parts.items()
     }
-    found = detector(network(tmp_path / "n.onnx", layout), layout).detect(Frame(image(width, height, **targets), 0.0))
+    found = (
+        detector(network(tmp_path / "n.onnx", layout), layout).detect(Frame(image(width, height, **targets), 0.0)).boxes
+    )
     assert [each.score for each in found] == pytest.approx(SCORES, abs=1e-3)
     pixel = max(width / SIDE[0], height / SIDE[1])
     for found_at, target in zip(map(edges_of, boxes(found)), map(edges_of, targets.values()), strict=True):
@@ -155,8 +157,10 @@ def test_boxes_of_every_layout_are_where_the_targets_are(tmp_path, layout, width
 def test_only_the_wanted_classes_are_found(tmp_path, layout):
     picture = image(96, 64, red=(8, 4, 20, 8), green=(30, 30, 16, 6), blue=(60, 10, 8, 8))
     path = network(tmp_path / "n.onnx", layout)
-    assert boxes(detector(path, layout, classes=(2,)).detect(Frame(picture, 0.0))) == [pytest.approx([60, 10, 8, 8])]
-    found = detector(path, layout, classes=(2, 0), least_score=0.75).detect(Frame(picture, 0.0))
+    assert boxes(detector(path, layout, classes=(2,)).detect(Frame(picture, 0.0)).boxes) == [
+        pytest.approx([60, 10, 8, 8])
+    ]
+    found = detector(path, layout, classes=(2, 0), least_score=0.75).detect(Frame(picture, 0.0)).boxes
     assert boxes(found) == [pytest.approx([8, 4, 20, 8])]
 
 
@@ -165,12 +169,12 @@ def test_images_are_searched_in_tiles_without_doubles_at_their_seams(tmp_path):
     find = detector(network(tmp_path / "n.onnx", "yolo", (192, 128)), tiled=True)
     for y in range(0, 390, 61):
         for x in range(0, 588, 23):
-            found = find.detect(Frame(image(600, 400, red=(x, y, 12, 10)), 0.0))
+            found = find.detect(Frame(image(600, 400, red=(x, y, 12, 10)), 0.0)).boxes
             assert boxes(found) == [pytest.approx([x, y, 12, 10])]
-    found = find.detect(Frame(image(600, 400, red=(120, 100, 300, 180)), 0.0))
+    found = find.detect(Frame(image(600, 400, red=(120, 100, 300, 180)), 0.0)).boxes
     assert len(found) == 1
     np.testing.assert_allclose(boxes(found), [[120, 100, 300, 180]], atol=3.2)
-    assert find.detect(Frame(image(600, 400), 0.0)) == []
+    assert find.detect(Frame(image(600, 400), 0.0)).boxes == []
 
 
 @pytest.mark.parametrize("off", [-0.1, -0.05, 0.05, 0.1])
@@ -182,7 +186,7 @@ def test_boxes_that_are_not_exact_are_one_at_seams_too(tmp_path, off):
         height = max(8, width * 2 // 3)
         for _ in range(6):
             x, y = rng.integers(0, (600 - width, 400 - height))
-            found = boxes(find.detect(Frame(image(600, 400, red=(x, y, width, height)), 0.0)))
+            found = boxes(find.detect(Frame(image(600, 400, red=(x, y, width, height)), 0.0)).boxes)
             assert len(found) == 1, (width, x, y)
             np.testing.assert_allclose(edges_of(found[0]), edges_of((x, y, width, height)), atol=3.5 + 0.06 * width)
 
@@ -190,10 +194,10 @@ def test_boxes_that_are_not_exact_are_one_at_seams_too(tmp_path, off):
 def test_levels_are_scaled_as_the_table_says(tmp_path):
     path = network(tmp_path / "n.onnx", "yolo")
     dim = (image(96, 64, red=(8, 4, 20, 8)) // 3).astype(np.uint8)
-    assert detector(path).detect(Frame(dim, 0.0)) == []
-    assert len(detector(path, std=(100.0, 255.0, 255.0)).detect(Frame(dim, 0.0))) == 1
-    assert len(detector(path, mean=(20.0, 0.0, 0.0), std=(100.0, 255.0, 255.0)).detect(Frame(dim, 0.0))) == 1
-    assert detector(path, mean=(0.0, 0.0, 20.0), std=(255.0, 255.0, 100.0)).detect(Frame(dim, 0.0)) == []
+    assert detector(path).detect(Frame(dim, 0.0)).boxes == []
+    assert len(detector(path, std=(100.0, 255.0, 255.0)).detect(Frame(dim, 0.0)).boxes) == 1
+    assert len(detector(path, mean=(20.0, 0.0, 0.0), std=(100.0, 255.0, 255.0)).detect(Frame(dim, 0.0)).boxes) == 1
+    assert detector(path, mean=(0.0, 0.0, 20.0), std=(255.0, 255.0, 100.0)).detect(Frame(dim, 0.0)).boxes == []
 
 
 def test_a_file_that_leaves_its_size_open_takes_that_of_the_table(tmp_path):
@@ -204,7 +208,7 @@ def test_a_file_that_leaves_its_size_open_takes_that_of_the_table(tmp_path):
     onnx.save(model, path)
     with pytest.raises(ConfigError, match=r"leaves the size of its input open; write network.input_px = \[640, 640\]"):
         detector(path)
-    assert len(detector(path, input_px=SIDE).detect(Frame(image(96, 64, red=(8, 4, 20, 8)), 0.0))) == 1
+    assert len(detector(path, input_px=SIDE).detect(Frame(image(96, 64, red=(8, 4, 20, 8)), 0.0)).boxes) == 1
 
 
 def test_a_file_that_opencv_cannot_run_is_run_by_onnxruntime(tmp_path, monkeypatch):
@@ -219,7 +223,7 @@ def test_a_file_that_opencv_cannot_run_is_run_by_onnxruntime(tmp_path, monkeypat
     onnx.save(model, path)
     with pytest.raises(cv2.error):
         cv2.dnn.readNetFromONNX(str(path))
-    found = detector(path).detect(Frame(image(96, 64, green=(30, 10, 16, 6)), 0.0))
+    found = detector(path).detect(Frame(image(96, 64, green=(30, 10, 16, 6)), 0.0)).boxes
     assert boxes(found) == [pytest.approx([30, 10, 16, 6])]
 
     real = builtins.__import__
@@ -248,9 +252,9 @@ def test_a_network_that_finds_nothing_gives_no_rows(tmp_path, raw):
     if raw:
         g("Reshape", table, g.const(raw["raw"], np.int64), name="raw")
     find = detector(g.save(tmp_path / "n.onnx", **raw, output=[1, "found", 6]), "yolov10")
-    assert find.detect(Frame(image(96, 64), 0.0)) == []
-    assert boxes(find.detect(Frame(image(96, 64, red=(8, 4, 20, 8)), 0.0))) == [pytest.approx([8, 4, 20, 8])]
-    assert find.detect(Frame(image(96, 64), 0.0)) == []
+    assert find.detect(Frame(image(96, 64), 0.0)).boxes == []
+    assert boxes(find.detect(Frame(image(96, 64, red=(8, 4, 20, 8)), 0.0)).boxes) == [pytest.approx([8, 4, 20, 8])]
+    assert find.detect(Frame(image(96, 64), 0.0)).boxes == []
 
 
 def beside(path, runtime, first, **heads):
@@ -286,8 +290,8 @@ def test_the_output_of_the_layout_is_read_beside_raw_heads(tmp_path, layout, sha
     assert str(Network(NetworkConfig(path, layout.split()[0]))).endswith(f"run by {runtime}")
     find = detector(path, layout)
     for x in (8, 40):
-        assert boxes(find.detect(Frame(image(96, 64, red=(x, 4, 20, 8)), 0.0))) == [pytest.approx([x, 4, 20, 8])]
-    assert find.detect(Frame(image(96, 64), 0.0)) == []
+        assert boxes(find.detect(Frame(image(96, 64, red=(x, 4, 20, 8)), 0.0)).boxes) == [pytest.approx([x, 4, 20, 8])]
+    assert find.detect(Frame(image(96, 64), 0.0)).boxes == []
 
 
 def test_an_output_that_is_not_known_to_be_the_one_is_refused_with_the_way_out(tmp_path):
@@ -308,7 +312,9 @@ def test_one_table_of_boxes_and_scores_is_an_rtdetr_too(tmp_path):
     sizes = [g("Mul", g("Sub", b, a), 1 / n) for a, b, n in ((left, right, SIDE[0]), (top, bottom, SIDE[1]))]
     g("Concat", *centers, *sizes, g("Mul", score, [np.eye(3)]), axis=2, name="output")
     find = detector(g.save(tmp_path / "n.onnx", output=[1, 3, 7]), "rtdetr")
-    assert boxes(find.detect(Frame(image(96, 64, blue=(8, 4, 20, 8)), 0.0))) == [pytest.approx([8, 4, 20, 8], abs=0.01)]
+    assert boxes(find.detect(Frame(image(96, 64, blue=(8, 4, 20, 8)), 0.0)).boxes) == [
+        pytest.approx([8, 4, 20, 8], abs=0.01)
+    ]
 
 
 def test_another_layout_gives_no_wrong_boxes(tmp_path):
@@ -318,7 +324,7 @@ def test_another_layout_gives_no_wrong_boxes(tmp_path):
         path = network(tmp_path / f"{written}.onnx", written)
         for read in {each.split()[0] for each in LAYOUTS} - {written.split()[0], "detr", "rtdetr"}:
             with contextlib.suppress(ConfigError):
-                found = detector(path, read).detect(Frame(image(96, 64, red=target), 0.0))
+                found = detector(path, read).detect(Frame(image(96, 64, red=target), 0.0)).boxes
                 assert found == [], (written, read)
 
 
@@ -373,7 +379,7 @@ def test_files_that_take_something_else_are_refused(tmp_path):
     for tensor in weights.graph.initializer:
         weights.graph.input.insert(0, onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, tensor.dims))
     onnx.save(weights, tmp_path / "weights.onnx")
-    found = detector(tmp_path / "weights.onnx").detect(Frame(image(96, 64, green=(30, 10, 16, 6)), 0.0))
+    found = detector(tmp_path / "weights.onnx").detect(Frame(image(96, 64, green=(30, 10, 16, 6)), 0.0)).boxes
     assert boxes(found) == [pytest.approx([30, 10, 16, 6])]
 
 

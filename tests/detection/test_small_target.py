@@ -56,7 +56,7 @@ def photograph(picture, rng):
 
 def watch(pictures, detector=None):
     detector = detector or SmallTargetDetector()
-    return [detector.detect(Frame(picture, i / RATE)) for i, picture in enumerate(pictures)]
+    return [detector.detect(Frame(picture, i / RATE)).boxes for i, picture in enumerate(pictures)]
 
 
 def follow(pictures):
@@ -200,7 +200,7 @@ def test_a_bird_in_front_of_rough_ground_is_found_at_a_hundred_frames_a_second()
     for i in range(240):
         picture, at = ground.copy(), (30 + 40 * i / rate, 205)
         draw(picture, *at, 10, 7, grey=40.0)
-        tracks = tracker.update(detector.detect(Frame(photograph(picture, rng), i / rate)), i / rate)
+        tracks = tracker.update(detector.detect(Frame(photograph(picture, rng), i / rate)).boxes, i / rate)
         on.append(any(np.linalg.norm(t.center_px - at) < 5 for t in tracks if t.confirmed))
     assert np.mean(on[120:]) > 0.9
 
@@ -218,14 +218,15 @@ def test_a_bird_of_a_pixel_is_found_in_a_small_picture(times):
     size = WIDTH // times, HEIGHT // times
     part = np.divide(size, (WIDTH, HEIGHT))
     detector = SmallTargetDetector()
-    found = watch([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in film(80, paint)], detector)
-    assert detector.mask.shape == size[::-1]
-    u, v = found[-1][0].center_px
-    assert detector.mask[round(v), round(u)] > 100
+    pictures = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in film(80, paint)]
+    found = [detector.detect(Frame(picture, i / RATE)) for i, picture in enumerate(pictures)]
+    assert found[-1].mask.shape == size[::-1]
+    u, v = found[-1].boxes[0].center_px
+    assert found[-1].mask[round(v), round(u)] > 100
     off = []
     for i in range(30, 80):
         place = (np.array(at(i)) + 0.5) * part - 0.5
-        off.append(min((np.linalg.norm(each.center_px - place) for each in found[i]), default=np.inf))
+        off.append(min((np.linalg.norm(each.center_px - place) for each in found[i].boxes), default=np.inf))
     assert np.mean(np.array(off) < 0.7) > 0.9
     assert np.median(off) < 0.2
 
@@ -439,12 +440,13 @@ def test_frames_that_repeat_and_times_that_jump():
     pictures = film(24, paint)
     detector = SmallTargetDetector()
     for i, picture in enumerate(pictures):
-        found = detector.detect(Frame(picture, i / RATE))
+        found = detector.detect(Frame(picture, i / RATE)).boxes
     assert found
-    assert detector.detect(Frame(pictures[-1], 24 / RATE)) == []
+    assert detector.detect(Frame(pictures[-1], 24 / RATE)).boxes == []
     for t in (100.0, 1.0, 1.0, 1.04):
         assert (
-            detector.detect(Frame(photograph(landscape(np.random.default_rng(0)), np.random.default_rng(1)), t)) == []
+            detector.detect(Frame(photograph(landscape(np.random.default_rng(0)), np.random.default_rng(1)), t)).boxes
+            == []
         )
     with pytest.raises(CotargetError, match="320x240 to 200x100"):
         detector.detect(Frame(np.zeros((100, 200, 3), np.uint8), 2.0))

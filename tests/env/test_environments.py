@@ -9,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 from cotarget.config import RigConfig
+from cotarget.detection import Detections
 from cotarget.env import FOLLOW, SCHEDULE, Follow, PipelinePolicy, Schedule, SchedulingPolicy
 from cotarget.env.common import RIG_FEATURES, Units
 from cotarget.env.follow import TRACK_FEATURES
@@ -166,7 +167,7 @@ def test_a_target_that_is_missed_is_still_known_for_a_while(field):
     for _ in range(20):
         observation, *_ = env.step(STILL)
     sure = named(observation)
-    env.episode.detector.detect = lambda frame: []
+    env.episode.detector.detect = lambda frame: Detections([])
     for k in range(1, 4):
         unseen = named(env.step(STILL)[0])
         assert (unseen["known"], unseen["detected"]) == (1.0, 0.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import Detection
+from cotarget.detection import Detection, Detections
 from cotarget.estimation import TargetFilter, filter_settings
 from cotarget.pipeline import State, follow
 from experiments.calibration.synthetic.rig import SIZE, Truth
@@ -50,8 +50,8 @@ class Approach:
         low, high = np.maximum(low + noise[0], -0.5), np.minimum(high + noise[1], LAST)
         return Detection((low + high) / 2, high - low, 1.0, bool(cut.any()))
 
-    def detect(self, frame):
-        return [self.box(FIXED, frame.t)]
+    def detect(self, frame, held=()):
+        return Detections([self.box(FIXED, frame.t)])
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.4, 3.0, 10.0])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cotarget.detection import Detection
+from cotarget.detection import Detection, Detections
 from cotarget.rig import Frame
 from cotarget.sim.targets.random_paths import GROUPED, group_paths, in_view
 from cotarget.sim.truth import Silhouette
@@ -41,13 +41,11 @@ def test_the_first_of_five_is_in_view_before_the_shortest_run_ends(kind):
 class Seer:
     """Finds what it is given."""
 
-    mask = None
-
     def __init__(self, found):
         self.found = found
 
-    def detect(self, frame):
-        return [Detection(center, SIDE, 0.9, False) for center in self.found(frame.t)]
+    def detect(self, frame, held=()):
+        return Detections([Detection(center, SIDE, 0.9, False) for center in self.found(frame.t)])
 
 
 def watch(found, shift=(0.0, 0.0), camera=STANDS):

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from cotarget.config import parse_config
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome
+from cotarget.detection import Detections
 from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, true_calibration
 from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings
@@ -37,7 +38,7 @@ def seen_well(config, target, seconds, *, pictures=False):
         detector = TruthDetector(world.truth(), config.sim.seed, TruthNoise(0.2, 0.01, 0.0))
         image = np.zeros((480, 640, 3), np.uint8)
         times = [k / config.sim.fixed.rate_hz for k in range(round(seconds * config.sim.fixed.rate_hz) + 1)]
-        frames = {round(t * 1e6): Seen(tuple(detector.detect(Frame(image, t)))) for t in times}
+        frames = {round(t * 1e6): Seen(tuple(detector.detect(Frame(image, t)).boxes)) for t in times}
     return WideView(frames, pictures=False)
 
 
@@ -62,10 +63,11 @@ def test_a_recorded_view_gives_the_same_frames_and_detections():
             assert recorded.t == t
             np.testing.assert_array_equal(recorded.image, frame.image)
             assert world.rig.clock.now() == pytest.approx(t + 0.3)
-            for old, new in zip(again.detect(recorded), detector.detect(frame), strict=True):
+            again_found, found = again.detect(recorded), detector.detect(frame)
+            for old, new in zip(again_found.boxes, found.boxes, strict=True):
                 np.testing.assert_array_equal(old.center_px, new.center_px)
-            np.testing.assert_array_equal(again.mask, detector.mask)
-        assert len(again.detect(recorded)) == 1
+            np.testing.assert_array_equal(again_found.mask, found.mask)
+        assert len(again.detect(recorded).boxes) == 1
 
 
 # ---------------------------------------------------------------- delay
@@ -224,8 +226,8 @@ def test_a_shot_is_skipped_while_the_target_is_not_detected(exact, monkeypatch):
     """Chances come at 3.0, 3.8, 4.6 and 5.4 s, and from 4.3 s on nothing is detected any more."""
 
     class Blinded(TruthDetector):
-        def detect(self, frame):
-            return super().detect(frame) if frame.t < 4.3 else []
+        def detect(self, frame, held=()):
+            return super().detect(frame) if frame.t < 4.3 else Detections([])
 
     config = hold_config("book", 1)
     with (world := SimWorld(config, rendered=())).rig:

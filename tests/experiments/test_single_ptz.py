@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS
+from cotarget.detection import Detections
 from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.rig import Frame
 from cotarget.sim.truth import Outlines
@@ -86,13 +87,11 @@ def test_a_run_without_a_start_does_not_change_the_other_figures():
 class Blind:
     """Finds the book as the truth has it, until a time; then nothing."""
 
-    mask = None
-
     def __init__(self, truth, until):
         self._finder, self._until = TruthDetector(truth, 0, TruthNoise(0.0, 0.0, 0.0), camera="zoom"), until
 
-    def detect(self, frame):
-        return self._finder.detect(frame) if frame.t < self._until else []
+    def detect(self, frame, held=()):
+        return self._finder.detect(frame) if frame.t < self._until else Detections([])
 
 
 def looked(world, until, seconds):
@@ -151,4 +150,4 @@ def test_the_picture_moves_when_the_head_does(world):
     assert shaken.moves(1.3)
     assert shaken.misses(1.3)
     assert np.mean([shaken.misses(0.5 + i * 1e-3) for i in range(100)]) < 0.2  # of a picture that stands, 5 %
-    assert shaken.detect(Frame(image, 1.3)) == []
+    assert shaken.detect(Frame(image, 1.3)).boxes == []

@@ -14,7 +14,7 @@ import pytest
 from cotarget.config import RigConfig as Config
 from cotarget.config import SafetyConfig, SimConfig
 from cotarget.control.selection import POLICIES, Chosen
-from cotarget.detection import Detection
+from cotarget.detection import Detection, Detections
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.evaluation import TruthDetector, true_calibration
 from cotarget.fusion import FusionSettings
@@ -395,10 +395,10 @@ class Crowd:
     def at(self, number, t):
         return self.places[number] + (self.swing * math.sin(2 * t), 0.0, 0.0)
 
-    def detect(self, frame):
+    def detect(self, frame, held=()):
         size = 686 * 0.234 / 10.0
         pixels = FIXED.project(np.array([self.at(n, frame.t) for n in range(len(self.places))]))
-        return [Detection(pixel, np.array([size, 1.4 * size]), 1.0) for pixel in pixels]
+        return Detections([Detection(pixel, np.array([size, 1.4 * size]), 1.0) for pixel in pixels])
 
 
 NUMBER = 77  # there are more tracks than are known in 3D

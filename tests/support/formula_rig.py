@@ -9,7 +9,7 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import Detection
+from cotarget.detection import Detection, Detections
 from cotarget.errors import StaleFrameError
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
@@ -126,30 +126,28 @@ class _Head:
 class Seer:
     """Detects the book where it is, at the frame's own time, whenever ``visible`` says so."""
 
-    mask = None
+    mask = None  # that of every frame
 
     def __init__(self, path, visible=lambda t: True, jitter=0.0):
         self.path, self.visible = path, visible
         self.jitter = itertools.cycle([1 + jitter, 1 - jitter])
 
-    def detect(self, frame):
+    def detect(self, frame, held=()):
         if not self.visible(frame.t):
-            return []
+            return Detections([], lambda: self.mask)
         x_fixed = np.asarray(self.path(frame.t), float)
         size = 686 * 0.234 / x_fixed[2] * next(self.jitter)
-        return [Detection(FIXED.project(x_fixed)[0], np.array([size, 1.4 * size]), 1.0)]
+        return Detections([Detection(FIXED.project(x_fixed)[0], np.array([size, 1.4 * size]), 1.0)], lambda: self.mask)
 
 
 class Both:
     """Detects what each of several detectors does."""
 
-    mask = None
-
     def __init__(self, *seers):
         self.seers = seers
 
-    def detect(self, frame):
-        return [found for seer in self.seers for found in seer.detect(frame)]
+    def detect(self, frame, held=()):
+        return Detections([found for seer in self.seers for found in seer.detect(frame).boxes])
 
 
 def still(t):

@@ -16,7 +16,7 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS, RigConfig
-from cotarget.detection import Detection
+from cotarget.detection import Detection, Detections
 from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.recording.recorder import Recorder
@@ -141,18 +141,15 @@ class ToyBoard:
 class Bright:
     """Sees what is bright, to a fraction of a pixel that depends on every one of them."""
 
-    def __init__(self):
-        self.mask = None
-
-    def detect(self, frame):
+    def detect(self, frame, held=()):
         grey = frame.image.mean(axis=2)
-        self.mask = ((grey > 150) * 255).astype(np.uint8)
-        rows, columns = np.nonzero(self.mask)
+        mask = ((grey > 150) * 255).astype(np.uint8)
+        rows, columns = np.nonzero(mask)
         if not len(rows):
-            return []
+            return Detections([], lambda: mask)
         weights = grey[rows, columns] + 1e-3 * frame.image.sum()
         center = np.array([np.average(columns, weights=weights), np.average(rows, weights=weights)])
-        return [Detection(center, np.array([9.0, 9.0]), 1.0)]
+        return Detections([Detection(center, np.array([9.0, 9.0]), 1.0)], lambda: mask)
 
 
 def calibration():
