@@ -20,11 +20,11 @@ import numpy as np
 from cotarget import backends
 from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetProfile
-from cotarget.control.selection import FirstCome
+from cotarget.control.selection import FirstCome, candidates_of
 from cotarget.detection import Detector, make_detector
 from cotarget.errors import ConfigError
 from cotarget.evaluation import true_calibration
-from cotarget.fusion import TargetFusion
+from cotarget.fusion import TargetFusion, ZoomSearch
 from cotarget.rig import Frame, PanTiltLimits
 from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
@@ -69,7 +69,8 @@ class Pipeline:
         self.tracks: list[Track] = []
         self.calibration = calibration_of(size)
         self.tracker, self.policy = Tracker(tracking_settings(self.target), size), FirstCome()
-        self.fusion = TargetFusion(self.calibration, self.target, size)
+        self.fusion, self.size = TargetFusion(self.calibration, self.target), size
+        self.search = ZoomSearch(self.calibration, self.target)
         spec = backends.describe(RigConfig())
         pan, tilt = spec.head.limits.pan, spec.head.limits.tilt
         self.reach = Reach(pan, tilt, spec.zoom.focal_range)
@@ -82,10 +83,12 @@ class Pipeline:
         found = self.detector.detect(frame, self.tracks)
         detected = time.perf_counter()
         self.tracks = self.tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
-        self.fusion.update_fixed(frame, self.tracks, found.mask)
-        number = self.policy.select(self.fusion.candidates(self.tracks, frame.t), np.zeros(2), self.limits)
-        self.fusion.follow(number)
-        estimate = None if number is None else self.fusion.estimate(number, frame.t + LEAD_S)
+        self.fusion.update(frame, self.tracks, found.mask, [self.search])
+        targets, T_base_fixed = self.fusion.targets, self.calibration.zoom_head.T_base_fixed
+        candidates = candidates_of(targets.values(), frame.t, T_base_fixed, self.size)
+        number = self.policy.select(candidates, np.zeros(2), self.limits)
+        self.search.follow(None if number is None else targets[number])
+        estimate = None if number is None else targets[number].estimate(frame.t + LEAD_S)
         tracked = time.perf_counter()
         if estimate is not None:
             self.aim = aim(self.calibration, estimate.x_fixed, self.reach, wanted_size=estimate.wanted_size)

@@ -50,9 +50,7 @@ def rendered(settings: SweepSpeedSettings, number: int) -> list[Row]:
             frame = rig.fixed.read(newer_than=t)
             t = frame.t
             shown, found = rig.zoom.read(), detector.detect(frame).boxes
-            rows.append(
-                {"t": t, "grey": float(shown.image.mean()), "u": sum(float(one.center_px[0]) for one in found.boxes)}
-            )
+            rows.append({"t": t, "grey": float(shown.image.mean()), "u": sum(float(one.center_px[0]) for one in found)})
     return rows
 
 

@@ -21,7 +21,7 @@ from cotarget.config import RigConfig
 from cotarget.detection import AutoDetector, BackgroundDetector, SmallTargetDetector, make_detector
 from cotarget.errors import CotargetError
 from cotarget.evaluation import true_calibration
-from cotarget.fusion import TargetFusion
+from cotarget.fusion import TargetFusion, ZoomSearch
 from cotarget.pipeline import follow
 from cotarget.sim.world import SimWorld
 from cotarget.tracking.tracker import Tracker
@@ -38,8 +38,8 @@ PARTS: Mapping[str, tuple[tuple[type, str], ...]] = {
         (SmallTargetDetector, "detect"),
     ),
     "track": ((Tracker, "update"),),
-    "position": ((TargetFusion, "update_fixed"),),
-    "close_up": ((TargetFusion, "update_zoom"),),
+    "position": ((TargetFusion, "update"),),
+    "close_up": ((ZoomSearch, "update"),),
 }
 REST = "control"
 # Goals: largest ratio of a turn to the median of MOG2 alone.

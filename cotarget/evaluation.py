@@ -171,7 +171,7 @@ class TruthFinder:
         self._truth, self._name, self._missed = truth, name, missed
         self._numbers_at = counted(seed + FINDER_SEED)
 
-    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
+    def store(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
         """Do nothing: the ground truth is always known."""
 
     def fixed_view_at(self, t: float) -> bool:

@@ -1,8 +1,9 @@
-"""Fuse fixed- and zoom-camera measurements into one 3D state per track.
+"""Fuse the measurements of both cameras into the 3D filters of the targets.
 
-Each track of the fixed camera has its own target filter. The followed track is also registered in the zoom image, which
-triangulates its depth and shows errors of the head and of the calibration. `StateHistory` interpolates the states of
-head and lens to the exposure time of each zoom frame. Measurements: docs/design-notes.md.
+`TargetFusion` keeps a `Target` for each track of the fixed camera, and adds the track's boxes to its filter.
+`ZoomSearch` registers the target that a head follows in its zoom image, which triangulates the depth and shows errors
+of the head and of the calibration. `StateHistory` interpolates the states of head and lens to the exposure time of each
+zoom frame. Measurements: docs/design-notes.md.
 """
 
 import math
@@ -16,15 +17,13 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
-from cotarget.control.selection import Candidate, leaves_in
-from cotarget.control.zoom import is_seen_well, shape_of
 from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
 from cotarget.estimation.motion_model import GATE, HEAD_SIGMA
 from cotarget.estimation.target_filter import inflated
 from cotarget.estimation.zoom_matching import CloseupFinder, Expected, Finder, MatchingSettings, ZoomMeasurement
 from cotarget.geometry import Array
-from cotarget.pantilt import towards
 from cotarget.rig import Detection, Frame, Image, PanTiltState, ZoomState
+from cotarget.targets import Target
 from cotarget.tracking.track import LARGEST_AREA_RATIO, Track, missing, room_inside
 
 REMEMBERED_S = 2.0  # longer than any latency [s]
@@ -64,7 +63,7 @@ class StateHistory:
         _append(self._heads, (head.t, head.pan, head.tilt))
         _append(self._lenses, (lens.t, math.log(lens.focal_px)))
 
-    def at(self, t: float) -> Pose | None:
+    def interpolate(self, t: float) -> Pose | None:
         """Interpolate head and lens to time t [s]; None if t is not between two kept states."""
         if not all(kept and kept[0][0] <= t <= kept[-1][0] for kept in (self._heads, self._lenses)):
             return None
@@ -121,7 +120,7 @@ class FusionSettings:
 
 @dataclass(frozen=True)
 class FixedMeasurement:
-    """Measurement of a track by one frame of the fixed camera, for `TargetFilter.update_fixed`.
+    """Measurement of a track by one frame of the fixed camera, for `TargetFilter.add_fixed`.
 
     Attributes:
         box: bounding box; the size of a clipped one is only a lower bound.
@@ -152,44 +151,129 @@ def measure(track: Track, target: TargetProfile) -> FixedMeasurement:
 
 
 class ZoomSearch:
-    """Search for the followed target in the zoom image.
+    """Search for the followed target in one zoom camera's images.
 
     Attributes:
-        finder: registers the target; a new one for each followed track.
+        states: states of head and lens by time.
+        target: the followed target; None for none.
+        finder: registers the target; a new one for each followed target.
         waiting: zoom frames without a fixed frame of their time, the oldest first.
         unfound_s: time for which the zoom image should have shown the target and did not [s].
         apart_s: time of the newest zoom frame less that of the newest fixed frame [s].
     """
 
     def __init__(
-        self, make_finder: Callable[[], Finder], settings: FusionSettings, filter: FilterSettings, latest_s: float
+        self,
+        calibration: Calibration,
+        profile: TargetProfile,
+        *,
+        closed_loop: bool = True,
+        finder: MakeFinder | None = None,
+        filter: FilterSettings | None = None,
+        matching: MatchingSettings | None = None,
+        settings: FusionSettings = FusionSettings(),
     ) -> None:
         """Create a search without a target.
 
         Args:
-            make_finder: makes the finder for a target.
+            calibration: calibration of the rig, for the streams in use.
+            profile: profile of the target.
+            closed_loop: whether zoom images are searched at all.
+            finder: makes the finder, once for each followed target; by default `CloseupFinder`.
+            filter: settings of the target filters, for the widened search; by default those of the profile.
+            matching: settings of the registration in the zoom image.
             settings: settings of the fusion.
-            filter: settings of the target filters, for the widened search.
-            latest_s: largest delay of one camera's frames against the other's [s].
         """
-        self._make_finder, self._settings, self._filter, self._latest_s = make_finder, settings, filter, latest_s
+        matching = matching or MatchingSettings()
+        self._make_finder = partial(finder or partial(CloseupFinder, settings=matching), calibration, profile)
+        self._filter = filter or filter_settings(profile, calibration)
+        self._settings, self._latest_s, self._closed_loop = settings, matching.latest_s, closed_loop
+        self.states = StateHistory()
         self.waiting: deque[Frame] = deque()
         self._zoom_t = math.inf
         self.apart_s = 0.0
-        self.start()
-
-    def start(self) -> None:
-        """Search for another target from now on."""
+        self.target: Target | None = None
         self.finder, self.unfound_s = self._make_finder(), 0.0
 
-    def add(self, frame: Frame, fixed_t: float) -> None:
-        """Add a zoom frame; fixed_t is the time of the newest fixed frame [s]."""
+    def follow(self, target: Target | None) -> None:
+        """Search for another target from now on; None for none."""
+        if target is not self.target:
+            self.target = target
+            self.finder, self.unfound_s = self._make_finder(), 0.0
+
+    def update(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
+        """Register the followed target in the zoom image and update its filter.
+
+        A zoom frame newer than the fixed camera's waits until the fixed camera has shown the target at about its time.
+
+        Args:
+            frame: frame of the zoom camera; None if there is no new one.
+            fixed_t: exposure time of the newest fixed frame [s].
+        """
+        if not self._closed_loop:
+            return None
+        if frame is not None:
+            self._keep(frame, fixed_t)
+        target = self.target
+        if target is None:
+            self.waiting.clear()
+            return None
+        due = self._due(fixed_t)
+        if due is None or target.filter is None:
+            return None
+        pose, estimate = self.states.interpolate(due.t), target.estimate(due.t)
+        if pose is None or estimate is None:
+            return None
+        target.unlikely = bool(_contradictions(estimate, self._settings))
+        found = self._find(due, pose, estimate)
+        if found is not None:
+            # Both cameras show the same point, but wings and limbs move it. With the registration's own error alone,
+            # the filter would take their beats for motion of the target.
+            sigma_px = np.hypot(found.sigma_px, found.body_sigma_px)
+            head_sigma = math.hypot(HEAD_SIGMA, pose.speed * self._settings.time_sigma_s)
+            target.filter.add_zoom(
+                found.center_px, sigma_px, pose.pan, pose.tilt, pose.nominal_px, due.t, head_sigma=head_sigma
+            )
+        return found
+
+    def warnings(self, estimate: Estimate | None) -> list[str]:
+        """Describe what contradicts the nominal size of the followed target or the calibration, a sentence each.
+
+        Args:
+            estimate: estimate of it at the time of the newest fixed frame.
+        """
+        if estimate is None:
+            return []
+        found = []
+        if wrong := _contradictions(estimate, self._settings):
+            found.append(f"the nominal size or the calibration seems wrong: {', '.join(wrong)}")
+        if abs(self.apart_s) > self._latest_s:
+            later = "zoom" if self.apart_s < 0 else "fixed"
+            apart = f"the {later} one comes {abs(self.apart_s):.2f} s later"
+            found.append(f"the cameras are too far apart in time: {apart}")
+        elif self.is_overdue:
+            unfound = f"for {self.unfound_s:.1f} s not found where the zoom camera should show it"
+            found.append(f"{unfound}: it is hidden there, or the nominal size or the calibration is wrong")
+        return found
+
+    @property
+    def is_overdue(self) -> bool:
+        """Whether the zoom image has failed to show the target for too long."""
+        return self.unfound_s > self._settings.unfound_s
+
+    @property
+    def is_unconfirmed(self) -> bool:
+        """Whether the zoom image has failed to show the target even to the widened search."""
+        return self.unfound_s > 2 * self._settings.unfound_s
+
+    def _keep(self, frame: Frame, fixed_t: float) -> None:
+        """Keep a zoom frame until it is due; fixed_t is the time of the newest fixed frame [s]."""
         self.waiting.append(frame)
         while self.waiting[0].t < frame.t - self._latest_s:
             self.waiting.popleft()
         self.apart_s = frame.t - fixed_t
 
-    def next_frame(self, fixed_t: float) -> Frame | None:
+    def _due(self, fixed_t: float) -> Frame | None:
         """Return the newest zoom frame for which the fixed camera has shown the target; drop it and older ones.
 
         Args:
@@ -201,7 +285,7 @@ class ZoomSearch:
             self.waiting.popleft()
         return due
 
-    def find(self, frame: Frame, pose: Pose, estimate: Estimate) -> ZoomMeasurement | None:
+    def _find(self, frame: Frame, pose: Pose, estimate: Estimate) -> ZoomMeasurement | None:
         """Find the target in a zoom frame.
 
         Args:
@@ -222,16 +306,6 @@ class ZoomSearch:
         self._count_unfound(frame, found, seen, estimate)
         return found
 
-    @property
-    def is_overdue(self) -> bool:
-        """Whether the zoom image has failed to show the target for too long."""
-        return self.unfound_s > self._settings.unfound_s
-
-    @property
-    def is_unconfirmed(self) -> bool:
-        """Whether the zoom image has failed to show the target even to the widened search."""
-        return self.unfound_s > 2 * self._settings.unfound_s
-
     def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
         """Count the time for which the zoom image should have shown the target and did not."""
         passed, self._zoom_t = min(max(frame.t - self._zoom_t, 0.0), self._settings.just_seen_s), frame.t
@@ -248,212 +322,111 @@ class ZoomSearch:
 
 
 class TargetFusion:
-    """Fuse the measurements of both cameras into one 3D estimate per track.
+    """Keep a `Target` for each track of the fixed camera, and update the filters of the most important ones.
 
     Args:
         calibration: calibration of the rig, for the streams in use.
-        target: profile of the target to follow.
-        size: (width, height) of the fixed camera's image [px].
-        closed_loop: whether the target is also registered in the zoom image.
-        finder: makes the finder for the zoom image, once for each followed track; by default `CloseupFinder`.
-        filter: settings of the target filters; by default those of the target profile.
-        matching: settings of the registration in the zoom image.
+        profile: profile of the targets.
+        filter: settings of the target filters; by default those of the profile.
         settings: settings of the fusion.
 
     Attributes:
-        states: states of head and lens by time.
-        search: search for the followed target in the zoom image.
+        targets: targets by id, in the order of the tracks.
     """
 
     def __init__(
         self,
         calibration: Calibration,
-        target: TargetProfile,
-        size: tuple[int, int],
-        *,
-        closed_loop: bool = True,
-        finder: MakeFinder | None = None,
+        profile: TargetProfile,
         filter: FilterSettings | None = None,
-        matching: MatchingSettings | None = None,
         settings: FusionSettings = FusionSettings(),
     ) -> None:
-        self._target, self._size, self._closed_loop, self._settings = target, size, closed_loop, settings
-        matching = matching or MatchingSettings()
-        make_finder = finder or partial(CloseupFinder, settings=matching)
-        self._latest_s = matching.latest_s
-        self._filter_settings = filter or filter_settings(target, calibration)
-        self._make_filter = partial(TargetFilter, calibration, target, self._filter_settings)
-        self._filters: dict[int, TargetFilter] = {}  # of the most important tracks
-        self._followed: int | None = None
-        self._seen_well_s: dict[int, float] = {}  # time for which each track was seen well in the close-up [s]
-        self._areas: dict[int, float] = {}  # area of the largest whole box of each track [px^2]
-        self._unlikely: set[int] = set()  # tracks whose size or pointing contradicts the priors
-        self._T_base_fixed = calibration.zoom_head.T_base_fixed
-        self.states = StateHistory()
-        make_finder = partial(make_finder, calibration, target)
-        self.search = ZoomSearch(make_finder, settings, self._filter_settings, matching.latest_s)
+        self._profile, self._settings = profile, settings
+        self._make_filter = partial(TargetFilter, calibration, profile, filter or filter_settings(profile, calibration))
+        self.targets: dict[int, Target] = {}
 
-    def follow(self, number: int | None) -> None:
-        """Register another track in the zoom image from now on; None for no track."""
-        if number != self._followed:
-            self._followed = number
-            self.search.start()
-
-    def update_fixed(
-        self, frame: Frame, tracks: Sequence[Track], mask: Image | None, favoured: Collection[int] = ()
+    def update(
+        self,
+        frame: Frame,
+        tracks: Sequence[Track],
+        mask: Image | None,
+        searches: Sequence[ZoomSearch] = (),
+        favoured: Collection[int] = (),
     ) -> None:
-        """Update the filters with the tracks of one fixed-camera frame.
+        """Update targets and filters with the tracks of one fixed-camera frame.
 
         Args:
             frame: frame of the fixed camera.
             tracks: tracks after that frame, the oldest first.
             mask: foreground of the detector, (H, W).
+            searches: searches for the followed targets in the zoom images.
             favoured: ids of tracks that get a filter before others.
         """
-        numbers = {track.id for track in tracks}
-        self._seen_well_s = {number: seconds for number, seconds in self._seen_well_s.items() if number in numbers}
-        self._unlikely &= numbers
-        self._areas = {number: area for number, area in self._areas.items() if number in numbers}
-        kept = self._most_important(tracks, favoured)
-        self._filters = {track.id: self._filters.get(track.id) or self._make_filter() for track in kept}
-        for track in kept:
-            if track.missed:
+        before = self.targets.values()
+        self.targets = {track.id: self._target(track) for track in tracks}
+        kept = self._most_important([search.target for search in searches], favoured)
+        for target in before:
+            if target not in kept:
+                target.filter = None
+        for target in kept:
+            if target.filter is None:
+                target.filter = self._make_filter()
+            if target.track.missed:
                 continue
-            if self._was_part(track):
-                self._filters[track.id] = self._make_filter()
-            measured = measure(track, self._target)
-            if track.id == self._followed and measured.is_whole:
-                fixed_view = self.search.finder.update_fixed(frame, measured.box, mask)
-                if fixed_view is not None:  # the same body point that the zoom image measures
-                    body = replace(measured.box, center_px=fixed_view.body_px)
-                    sigma_px = fixed_view.body_sigma_px
-                    if self._target.matcher == "upright":  # a box without the feet has its middle too high
-                        sigma_px = np.hypot(sigma_px, [0.0, abs(body.size_px[1] - track.size_px[1]) / 2])
-                    measured = replace(measured, box=body, sigma_px=sigma_px)
-            self._filters[track.id].update_fixed(
-                measured.box, frame.t, sigma_px=measured.sigma_px, size_px=measured.size_px
-            )
+            if _was_part(target):
+                target.filter = self._make_filter()
+            measured = measure(target.track, self._profile)
+            if measured.is_whole:
+                for search in searches:
+                    if search.target is target:
+                        measured = self._of_the_body(measured, target.track, search.finder, frame, mask)
+            target.filter.add_fixed(measured.box, frame.t, sigma_px=measured.sigma_px, size_px=measured.size_px)
 
-    def _was_part(self, track: Track) -> bool:
-        """Note the box's area; tell whether the boxes so far were of a part of the target, such as a hand."""
-        area = float(track.box.size_px.prod())
-        was_part = area >= LARGEST_AREA_RATIO * self._areas.get(track.id, math.inf)
-        if was_part:
-            del self._areas[track.id]
-        if not track.box.clipped and not track.shared:
-            self._areas[track.id] = max(area, self._areas.get(track.id, 0.0))
-        return was_part
+    def _target(self, track: Track) -> Target:
+        """Find or make the target of a track."""
+        known = self.targets.get(track.id)
+        if known is None:
+            return Target(track)
+        known.track = track
+        return known
 
-    def _most_important(self, tracks: Sequence[Track], favoured: Collection[int]) -> list[Track]:
-        """Select the tracks that have a filter, the followed one first."""
+    def _most_important(self, followed: Collection[Target | None], favoured: Collection[int]) -> list[Target]:
+        """Select the targets that have a filter, the followed ones first."""
 
-        def last(track: Track) -> tuple[bool, ...]:
+        def last(target: Target) -> tuple[bool, ...]:
             return (
-                track.id != self._followed,
-                track.id not in favoured,
-                not track.confirmed,
-                track.id not in self._filters,  # a new track must not displace a filter in use
+                target not in followed,
+                target.id not in favoured,
+                not target.track.confirmed,
+                target.filter is None,  # a new track must not displace a filter in use
             )
 
-        return sorted(tracks, key=last)[: self._settings.most_filters]
+        return sorted(self.targets.values(), key=last)[: self._settings.most_filters]
 
-    def update_zoom(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
-        """Register the followed target in the zoom image and update its filter.
+    def _of_the_body(
+        self, measured: FixedMeasurement, track: Track, finder: Finder, frame: Frame, mask: Image | None
+    ) -> FixedMeasurement:
+        """Measure the body point that the zoom image measures too, in place of the box's centre."""
+        fixed_view = finder.store(frame, measured.box, mask)
+        if fixed_view is None:
+            return measured
+        body = replace(measured.box, center_px=fixed_view.body_px)
+        sigma_px = fixed_view.body_sigma_px
+        if self._profile.matcher == "upright":  # a box without the feet has its middle too high
+            sigma_px = np.hypot(sigma_px, [0.0, abs(body.size_px[1] - track.size_px[1]) / 2])
+        return replace(measured, box=body, sigma_px=sigma_px)
 
-        A zoom frame newer than the fixed camera's waits until the fixed camera has shown the target at about its time.
 
-        Args:
-            frame: frame of the zoom camera; None if there is no new one.
-            fixed_t: exposure time of the newest fixed frame [s].
-        """
-        if not self._closed_loop:
-            return None
-        if frame is not None:
-            self.search.add(frame, fixed_t)
-        if self._followed is None:
-            self.search.waiting.clear()
-            return None
-        due = self.search.next_frame(fixed_t)
-        known = self._filters.get(self._followed)
-        if due is None or known is None:
-            return None
-        pose, estimate = self.states.at(due.t), known.at(due.t)
-        if pose is None or estimate is None:
-            return None
-        if _contradictions(estimate, self._settings):
-            self._unlikely.add(self._followed)
-        else:
-            self._unlikely.discard(self._followed)
-        found = self.search.find(due, pose, estimate)
-        if found is not None:
-            # Both cameras show the same point, but wings and limbs move it. With the registration's own error alone,
-            # the filter would take their beats for motion of the target.
-            sigma_px = np.hypot(found.sigma_px, found.body_sigma_px)
-            head_sigma = math.hypot(HEAD_SIGMA, pose.speed * self._settings.time_sigma_s)
-            known.update_zoom(
-                found.center_px, sigma_px, pose.pan, pose.tilt, pose.nominal_px, due.t, head_sigma=head_sigma
-            )
-        return found
-
-    def estimate(self, number: int, t: float) -> Estimate | None:
-        """Estimate a track at time t [s]; None if it has no filter or no measurement by then."""
-        known = self._filters.get(number)
-        return None if known is None else known.at(t)
-
-    def warnings(self, number: int, estimate: Estimate | None) -> list[str]:
-        """Describe what contradicts the nominal size of a target or the calibration.
-
-        Args:
-            number: id of the followed track.
-            estimate: estimate of it at the time of the newest fixed frame.
-
-        Returns:
-            One sentence for each contradiction; empty if there is none.
-        """
-        if estimate is None:
-            return []
-        found = []
-        if wrong := _contradictions(estimate, self._settings):
-            found.append(f"the nominal size or the calibration seems wrong: {', '.join(wrong)}")
-        apart_s = self.search.apart_s
-        if number == self._followed and abs(apart_s) > self._latest_s:
-            later = "zoom" if apart_s < 0 else "fixed"
-            found.append(f"the cameras are too far apart in time: the {later} one comes {abs(apart_s):.2f} s later")
-        elif number == self._followed and self.search.is_overdue:
-            unfound = f"for {self.search.unfound_s:.1f} s not found where the zoom camera should show it"
-            found.append(f"{unfound}: it is hidden there, or the nominal size or the calibration is wrong")
-        return found
-
-    def count_seen_well(self, track: Track, seconds: float, longest_px: float) -> None:
-        """Add to the time for which a track was seen well in the close-up, by the reported states at its time.
-
-        Args:
-            track: the track after the newest fixed frame.
-            seconds: time that this frame counts for [s].
-            longest_px: longest nominal focal length of the lens [px].
-        """
-        pose, estimate = self.states.at(track.t), self.estimate(track.id, track.t)
-        if pose is None or estimate is None or track.t - estimate.measured_t > self._settings.just_seen_s:
-            return
-        if is_seen_well(estimate, pose.pan, pose.tilt, pose.nominal_px, longest_px, shape=shape_of(track)):
-            self._seen_well_s[track.id] = self._seen_well_s.get(track.id, 0.0) + seconds
-
-    def candidates(self, tracks: Sequence[Track], t: float) -> list[Candidate]:
-        """List the confirmed tracks that may be selected at time t [s]."""
-        found = []
-        for track in tracks:
-            known = self._filters.get(track.id)
-            if track.confirmed and known is not None and known.knows(t):
-                direction = partial(self._direction, known, t)
-                seen_s, likely = self._seen_well_s.get(track.id, 0.0), track.id not in self._unlikely
-                found.append(Candidate(track, direction, leaves_in(track, self._size), seen_s, likely=likely))
-        return found
-
-    def _direction(self, known: TargetFilter, t: float, later: float) -> Array:
-        """Pan and tilt of a target from the head, (2,) [rad]; the zoom camera's offset on the head is neglected."""
-        estimate = known.at(t + later)
-        assert estimate is not None, "what is known at a time is known later"
-        return np.array(towards(self._T_base_fixed.apply(estimate.x_fixed)))
+def _was_part(target: Target) -> bool:
+    """Note the box's area; tell whether the boxes so far were of a part of the target, such as a hand."""
+    box, largest = target.track.box, target.largest_area_px
+    area = float(box.size_px.prod())
+    was_part = largest is not None and area >= LARGEST_AREA_RATIO * largest
+    if was_part:
+        target.largest_area_px = None
+    if not box.clipped and not target.track.shared:
+        target.largest_area_px = max(area, target.largest_area_px or 0.0)
+    return was_part
 
 
 def _contradictions(estimate: Estimate, settings: FusionSettings) -> list[str]:

@@ -7,9 +7,8 @@ may fail for a moment, because its lens moves, its line is slow or it reconnects
 
 import enum
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import NamedTuple
 
@@ -20,14 +19,14 @@ from cotarget.calibration.plausibility import check_plausible
 from cotarget.config import TargetProfile
 from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
-from cotarget.control.selection import FirstCome, TargetSelector
-from cotarget.control.zoom import ZoomSettings, shape_of
+from cotarget.control.selection import FirstCome, TargetSelector, candidates_of
+from cotarget.control.zoom import ZoomSettings, is_seen_well, shape_of
 from cotarget.detection import Detection, Detections, Detector, make_detector
 from cotarget.detection.base import flood
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices
 from cotarget.estimation import Estimate, FilterSettings
 from cotarget.estimation.zoom_matching import MatchingSettings, ZoomMeasurement
-from cotarget.fusion import FusionSettings, MakeFinder, TargetFusion
+from cotarget.fusion import FusionSettings, MakeFinder, TargetFusion, ZoomSearch
 from cotarget.rig import (
     FUTURE_S,
     READ_TIMEOUT_S,
@@ -42,6 +41,7 @@ from cotarget.rig import (
     opened_from,
 )
 from cotarget.targeting import Aim, target_implausibility
+from cotarget.targets import Target
 from cotarget.tracking.track import Track, TrackingSettings, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
@@ -388,150 +388,174 @@ class _Outcome(NamedTuple):
     aim: Aim | None = None
 
 
-class _Run:
-    """One run of `follow`."""
+class HeadRun:
+    """Select a target for one head, search it in the zoom image, and follow it.
+
+    Attributes:
+        head: newest state of the head.
+        lens: newest state of the lens.
+        controller: commands head and lens.
+        search: search for the followed target in the zoom image.
+    """
 
     def __init__(
         self,
         rig: Rig,
         calibration: Calibration,
-        target: TargetProfile,
-        detector: Detector,
+        profile: TargetProfile,
         selector: TargetSelector,
         settings: FollowSettings,
     ) -> None:
-        self._rig, self._settings = rig, settings
-        self._camera = CameraRun(detector, Tracker(settings.tracking or tracking_settings(target), rig.fixed.size))
-        self._fusion = TargetFusion(
+        """Start without a target."""
+        self._rig, self._selector, self._settings = rig, selector, settings
+        self._T_base_fixed = calibration.zoom_head.T_base_fixed
+        self.search = ZoomSearch(
             calibration,
-            target,
-            rig.fixed.size,
+            profile,
             closed_loop=settings.closed_loop,
             finder=settings.finder,
             filter=settings.filter,
             matching=settings.matching,
             settings=settings.fusion,
         )
-        self._controller = Controller(
-            rig, calibration, head=settings.head, zoom=settings.zoom, predict=settings.predict
-        )
-        self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
-        self._unreachable: set[int] = set()  # ids of tracks that could not be aimed at
-        self._selector = selector
-        self._selector.start(rig.fixed.size)
-        self._index = 0
+        self.controller = Controller(rig, calibration, head=settings.head, zoom=settings.zoom, predict=settings.predict)
+        selector.start(rig.fixed.size)
 
-    def step(self) -> Step:
-        """Process one frame of the fixed camera, in the order of the paper's Table 1."""
-        frame = self._frames.read_fixed()
-        interval = min(self._frames.interval, LONGEST_INTERVAL_S)
-        detections = self._camera.update(frame)
-        tracks = self._camera.tracks
-        zoom, found = self._estimate(frame, tracks, detections.mask)
-        followed = self._select(tracks)
-        outcome = (
-            self._search(tracks, detections.mask) if followed is None else self._follow(followed, frame.t, interval)
-        )
-        self._read_states()
-        estimate = None if followed is None else self._fusion.estimate(followed.id, frame.t)
-        warnings = [] if followed is None else self._fusion.warnings(followed.id, estimate)
-        self._index += 1
-        return Step(
-            index=self._index - 1,
-            t=self._rig.clock.now(),
-            state=outcome.state,
-            reason=_joined([*outcome.reasons, *warnings, *self._frames.faults()]),
-            fixed=frame,
-            zoom=zoom,
-            mask=detections.mask,
-            detections=tuple(detections.boxes),
-            tracks=tuple(tracks),
-            target=followed,
-            aim=outcome.aim,
-            commanded=self._controller.commanded,
-            head=self._head,
-            lens=self._lens,
-            estimate=estimate,
-            found=found,
-            head_commands=self._controller.head_commands,
-            lens_commands=self._controller.lens_commands,
-            skipped=self._skipped(),
-        )
-
-    def _estimate(self, frame: Frame, tracks: list[Track], mask: Image | None) -> tuple[Frame, ZoomMeasurement | None]:
-        """Update the 3D estimates with both cameras' newest frames; return the zoom frame and what it measured."""
-        favoured = {track.id for track in tracks if self._selector.favours(track)}
-        self._fusion.update_fixed(frame, tracks, mask, favoured)
-        self._read_states()
-        zoom = self._frames.read_zoom()
-        return zoom, self._fusion.update_zoom(zoom if self._frames.zoom_is_new else None, frame.t)
-
-    def _skipped(self) -> int:
-        """Number of frames of the fixed camera between the last two that were worked on."""
-        interval = self._frames.interval
-        return 0 if math.isinf(interval) else max(round(interval * self._rig.spec.fixed.rate_hz) - 1, 0)
-
-    def _read_states(self) -> None:
+    def read_states(self) -> None:
         """Read the states of head and lens."""
-        self._head, self._lens = self._rig.head.state(), self._rig.zoom.state()
-        self._fusion.states.add(self._head, self._lens)
+        self.head, self.lens = self._rig.head.state(), self._rig.zoom.state()
+        self.search.states.add(self.head, self.lens)
 
-    def _select(self, tracks: list[Track]) -> Track | None:
-        """Select the track to follow."""
-        now = self._rig.clock.now()
-        candidates = self._fusion.candidates(tracks, now)
-        if self._unreachable:  # a target may have become reachable
-            estimates = {number: self._fusion.estimate(number, now) for number in self._unreachable}
-            self._unreachable = {
-                n for n, each in estimates.items() if each is not None and not self._controller.can_reach(each)
-            }
-            candidates = [replace(each, reachable=each.id not in self._unreachable) for each in candidates]
-        head = np.array([self._head.pan, self._head.tilt])
+    def select(self, targets: Iterable[Target]) -> Target | None:
+        """Select the target to follow, and search it in the zoom image from the next frame on."""
+        now, targets = self._rig.clock.now(), list(targets)
+        for target in targets:
+            if target.unreachable:  # it may have become reachable
+                estimate = target.estimate(now)
+                target.unreachable = estimate is not None and not self.controller.can_reach(estimate)
+        head = np.array([self.head.pan, self.head.tilt])
+        candidates = candidates_of(targets, now, self._T_base_fixed, self._rig.fixed.size)
         number = self._selector.select(candidates, head, self._rig.head.limits)
-        self._fusion.follow(number)
-        return next((track for track in tracks if track.id == number), None)
+        found = next((target for target in targets if target.id == number), None)
+        self.search.follow(found)
+        return found
 
-    def _search(self, tracks: list[Track], mask: Image | None) -> _Outcome:
-        """Zoom out while no track is followed, and explain why none is."""
-        self._controller.zoom_out()
+    def wait(self, found: Detections, tracks: Sequence[Track]) -> _Outcome:
+        """Zoom out while no target is followed, and explain why none is."""
+        self.controller.zoom_out()
         if unmet := self._selector.unmet:
             return _Outcome(State.SEARCHING, (unmet,))
         if tracks:
             return _Outcome(State.SEARCHING, ("what is detected is not confirmed yet",))
-        part = flood(mask)
+        part = flood(found.mask)
         why = part and f": {part:.0%} of the fixed image changed at once, as when the light does or the camera moves"
         return _Outcome(State.SEARCHING, (f"nothing is detected{why or ''}",))
 
-    def _follow(self, followed: Track, t: float, interval: float) -> _Outcome:
-        """Aim at the followed track and command head and lens.
+    def follow(self, target: Target, t: float, interval: float) -> _Outcome:
+        """Aim at a target and command head and lens.
 
         Args:
-            followed: the followed track.
+            target: the followed target.
             t: time of the newest fixed frame [s].
             interval: time from one command to the next [s].
         """
-        self._fusion.count_seen_well(followed, interval, self._rig.zoom.focal_range[1])
-        predict, seen_t = partial(self._fusion.estimate, followed.id), followed.seen_t
-        if t - seen_t > self._settings.zoom_out_after_s:
-            reason, aim = self._follow_unseen(predict, seen_t, interval)
-            return _Outcome(State.LOST, (f"out of sight for {t - seen_t:.1f} s", reason), aim)
+        track = target.track
+        self.count_seen_well(target, interval)
+        if t - track.seen_t > self._settings.zoom_out_after_s:
+            reason, aim = self._follow_unseen(target.estimate, track.seen_t, interval)
+            return _Outcome(State.LOST, (f"out of sight for {t - track.seen_t:.1f} s", reason), aim)
         try:
-            drive = self._controller.drive(predict, seen_t, interval, shape=shape_of(followed))
+            drive = self.controller.drive(target.estimate, track.seen_t, interval, shape=shape_of(track))
         except UnreachableError as error:
-            self._unreachable.add(followed.id)
+            target.unreachable = True
             return _Outcome(State.UNREACHABLE, (str(error),))
         reasons = () if drive.zoom_reason == "wanted" else (f"zoom: {drive.zoom_reason}",)
-        if followed.missed:
+        if track.missed:
             return _Outcome(State.COASTING, reasons, drive.aim)
-        state = State.UNCONFIRMED if self._fusion.search.is_unconfirmed else State.FOLLOWING
+        state = State.UNCONFIRMED if self.search.is_unconfirmed else State.FOLLOWING
         return _Outcome(state, reasons, drive.aim)
+
+    def count_seen_well(self, target: Target, seconds: float) -> None:
+        """Count a time [s] if the close-up shows a target well, by the states at the newest fixed frame's time."""
+        track = target.track
+        pose, estimate = self.search.states.interpolate(track.t), target.estimate(track.t)
+        if pose is None or estimate is None or track.t - estimate.measured_t > self._settings.fusion.just_seen_s:
+            return
+        longest_px = self._rig.zoom.focal_range[1]
+        if is_seen_well(estimate, pose.pan, pose.tilt, pose.nominal_px, longest_px, shape=shape_of(track)):
+            target.seen_well_s += seconds
 
     def _follow_unseen(self, predict: Predict, seen_t: float, interval: float) -> tuple[str, Aim | None]:
         """Point where a target out of sight should be; return what the head does, and the aim."""
         try:
-            aim = self._controller.search(predict, seen_t, interval)
+            aim = self.controller.search(predict, seen_t, interval)
         except UnreachableError as error:
             return f"the head waits: {error}", None
         if aim is None:
             return "the head waits: where it is by now is not known well enough", None
         return "looked for where it should be", aim
+
+
+class _Run:
+    """One run of `follow`: a camera, the fusion, and a head."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        calibration: Calibration,
+        profile: TargetProfile,
+        detector: Detector,
+        selector: TargetSelector,
+        settings: FollowSettings,
+    ) -> None:
+        self._rig, self._selector = rig, selector
+        self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
+        self._camera = CameraRun(detector, Tracker(settings.tracking or tracking_settings(profile), rig.fixed.size))
+        self._fusion = TargetFusion(calibration, profile, settings.filter, settings.fusion)
+        self._head = HeadRun(rig, calibration, profile, selector, settings)
+        self._index = 0
+
+    def step(self) -> Step:
+        """Process one frame of the fixed camera, in the order of the paper's Table 1."""
+        frames, head = self._frames, self._head
+        frame = frames.read_fixed()
+        detections, tracks = self._camera.update(frame), self._camera.tracks
+        favoured = {track.id for track in tracks if self._selector.favours(track)}
+        self._fusion.update(frame, tracks, detections.mask, [head.search], favoured)
+        head.read_states()
+        zoom = frames.read_zoom()
+        found = head.search.update(zoom if frames.zoom_is_new else None, frame.t)
+        target = head.select(self._fusion.targets.values())
+        if target is None:
+            outcome = head.wait(detections, tracks)
+        else:
+            outcome = head.follow(target, frame.t, min(frames.interval, LONGEST_INTERVAL_S))
+        head.read_states()
+        estimate = None if target is None else target.estimate(frame.t)
+        self._index += 1
+        return Step(
+            index=self._index - 1,
+            t=self._rig.clock.now(),
+            state=outcome.state,
+            reason=_joined([*outcome.reasons, *head.search.warnings(estimate), *frames.faults()]),
+            fixed=frame,
+            zoom=zoom,
+            mask=detections.mask,
+            detections=tuple(detections.boxes),
+            tracks=tuple(tracks),
+            target=None if target is None else target.track,
+            aim=outcome.aim,
+            commanded=head.controller.commanded,
+            head=head.head,
+            lens=head.lens,
+            estimate=estimate,
+            found=found,
+            head_commands=head.controller.head_commands,
+            lens_commands=head.controller.lens_commands,
+            skipped=self._skipped(),
+        )
+
+    def _skipped(self) -> int:
+        """Number of frames of the fixed camera between the last two that were worked on."""
+        interval = self._frames.interval
+        return 0 if math.isinf(interval) else max(round(interval * self._rig.spec.fixed.rate_hz) - 1, 0)

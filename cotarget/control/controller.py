@@ -99,7 +99,7 @@ class Controller:
         pan, tilt, focal = self.commanded
         now = self._rig.clock.now()
         exposed = interval + (now + self._rig.spec.zoom.delay_s)
-        (pan_then, _), (tilt_then, _) = self._head_controller.head.at(exposed)
+        (pan_then, _), (tilt_then, _) = self._head_controller.head.predict(exposed)
         then = predict(exposed if self._predict else seen_t)
         focal_px, reason = self._zoom.choose(
             None if then is None else expect(then, pan_then, tilt_then, focal, shape=shape),

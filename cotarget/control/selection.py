@@ -7,7 +7,7 @@ people") turns to the target that leaves first; `most-served` plans the order th
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, NamedTuple, Protocol
@@ -15,8 +15,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from cotarget.errors import ConfigError, choices
-from cotarget.geometry import Array
+from cotarget.estimation import TargetFilter
+from cotarget.geometry import Array, RigidTransform
+from cotarget.pantilt import towards
 from cotarget.rig import Angles, PanTiltLimits
+from cotarget.targets import Target
 from cotarget.tracking.track import Track
 
 # Most targets whose orders are all searched, which takes some 3 ms; of more, those that leave first are taken.
@@ -428,6 +431,38 @@ class Chosen:
         """Vector from the click to a track's centre, (2,) [px]."""
         assert self.pixel is not None, "who asks has looked"
         return np.asarray(track.center_px - np.array(self.pixel))
+
+
+def candidates_of(
+    targets: Iterable[Target], t: float, T_base_fixed: RigidTransform, size: tuple[int, int]
+) -> list[Candidate]:
+    """List the targets that may be selected at time t [s]: confirmed ones whose place is known.
+
+    Args:
+        targets: all targets.
+        t: time [s].
+        T_base_fixed: pose of the fixed camera in the head's base.
+        size: (width, height) of the fixed image [px].
+    """
+    return [
+        Candidate(
+            target.track,
+            partial(_direction, target.filter, T_base_fixed, t),
+            leaves_in(target.track, size),
+            target.seen_well_s,
+            reachable=not target.unreachable,
+            likely=not target.unlikely,
+        )
+        for target in targets
+        if target.track.confirmed and target.filter is not None and target.filter.knows(t)
+    ]
+
+
+def _direction(filter: TargetFilter, T_base_fixed: RigidTransform, t: float, later: float) -> Array:
+    """Pan and tilt of a target from the head, (2,) [rad]; the zoom camera's offset on the head is neglected."""
+    estimate = filter.estimate(t + later)
+    assert estimate is not None, "what is known at a time is known later"
+    return np.array(towards(T_base_fixed.apply(estimate.x_fixed)))
 
 
 def leaves_in(track: Track, size: tuple[int, int]) -> float:

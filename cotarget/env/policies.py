@@ -64,7 +64,7 @@ class EnvironmentRig:
         effect = self.rig.clock.now() + self.rig.spec.head.delay_s
         if request.speed is not None:
             speeds = self._head.limits.capped(request.speed)
-            axes = zip(self._model.at(effect), (pan, tilt), speeds, strict=True)
+            axes = zip(self._model.predict(effect), (pan, tilt), speeds, strict=True)
             pan, tilt = (self._hurried(x, v, goal, speed) for (x, v), goal, speed in axes)
             pan, tilt = clipped(pan, tilt, self._head.limits)
         self._model.add_command(effect, HeadCommand(pan, tilt, None))

@@ -316,7 +316,7 @@ class TargetFilter:
         self._observed: list[FixedObservation | ZoomObservation] = []
         self._nodes: list[Node | None] = []  # state after each of them; None before the first in the fixed image
 
-    def update_fixed(
+    def add_fixed(
         self, detection: Detection, t: float, *, sigma_px: Array | None = None, size_px: float | None = None
     ) -> bool:
         """Add a detection in the fixed image.
@@ -350,7 +350,7 @@ class TargetFilter:
         size = self._size(side, J[int(vertical), int(vertical)], bound=detection.clipped)
         return self._insert(FixedObservation(t, z, (J * np.array([sigma_u**2, sigma_v**2])) @ J.T, size))
 
-    def update_zoom(
+    def add_zoom(
         self,
         pixel: Array,
         sigma_px: float | Array,
@@ -374,7 +374,7 @@ class TargetFilter:
                 uncertain.
 
         Returns:
-            False if the measurement was not added, see `update_fixed`.
+            False if the measurement was not added, see `add_fixed`.
         """
         lens = self._calibration.zoom_head.lens.at(nominal_px)
         found = lens.tangents(pixel)
@@ -384,7 +384,7 @@ class TargetFilter:
         R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * head_sigma**2
         return self._insert(ZoomObservation(t, z, R, self._sight_lines.at(pan, tilt, nominal_px)))
 
-    def at(self, t: float) -> Estimate | None:
+    def estimate(self, t: float) -> Estimate | None:
         """Estimate the target at a time [s], after the newest measurement or up to `history_s` before it.
 
         Returns:

@@ -352,7 +352,7 @@ class ZoomMeasurement:
 class Finder(Protocol):
     """Finds the followed target in zoom images; `CloseupFinder` describes the methods."""
 
-    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
+    def store(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
         """Store the target as a fixed-camera frame shows it."""
 
     def fixed_view_at(self, t: float) -> object | None:
@@ -383,7 +383,7 @@ class CloseupFinder:
         self._target, self._settings = target, settings
         self._fixed_views: deque[FixedView] = deque()
 
-    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
+    def store(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
         """Store the target as a fixed-camera frame shows it.
 
         Args:

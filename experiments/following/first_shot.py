@@ -24,11 +24,11 @@ from annotated_types import Gt, Le
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetProfile
 from cotarget.control.controller import reach_of
-from cotarget.control.selection import FirstCome
+from cotarget.control.selection import FirstCome, candidates_of
 from cotarget.detection import make_detector
 from cotarget.errors import UnreachableError
 from cotarget.evaluation import closeup_of, true_calibration
-from cotarget.fusion import TargetFusion
+from cotarget.fusion import TargetFusion, ZoomSearch
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Rig, to_step
 from cotarget.safety.safe_rig import guard
@@ -36,7 +36,8 @@ from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
-from cotarget.tracking.track import Track, tracking_settings
+from cotarget.targets import Target
+from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated
@@ -112,7 +113,7 @@ def fire(
             if shooter.frame.t < begin - ROUNDING:
                 continue
             begin = shooter.frame.t + EVERY_S
-            if shooter.track is None or shooter.track.missed or (shot := shooter.shoot()) is None:
+            if shooter.target is None or shooter.target.track.missed or (shot := shooter.shoot()) is None:
                 yield {"fired": False}
                 continue
             t = shot.exposed_t
@@ -154,7 +155,6 @@ class _Shooter:
 
     Attributes:
         frame: newest frame of the fixed camera.
-        track: selected track; None without one.
     """
 
     frame: Frame
@@ -164,10 +164,15 @@ class _Shooter:
         self._detector = make_detector(target, config.sim.fixed.rate_hz)
         self._tracker = Tracker(tracking_settings(target), rig.fixed.size)
         # The first is never updated from the zoom camera; its copy, from a shot to its correction, is.
-        self._fusions = [TargetFusion(calibration, target, rig.fixed.size)]
+        self._fusions = [(TargetFusion(calibration, target), ZoomSearch(calibration, target))]
         self._policy = FirstCome()
         self._t: float | None = None
-        self.track: Track | None = None
+        self._number: int | None = None
+
+    @property
+    def target(self) -> Target | None:
+        """The selected target; None without one."""
+        return None if self._number is None else self._fusions[-1][0].targets[self._number]
 
     def look(self) -> None:
         """Process the next frame of the fixed camera."""
@@ -176,23 +181,24 @@ class _Shooter:
         found = self._detector.detect(self.frame)
         tracks = self._tracker.update(found.boxes, self.frame.t)
         state = self._rig.head.state()
-        for fusion in self._fusions:
-            fusion.update_fixed(self.frame, tracks, found.mask)
-            fusion.states.add(state, self._rig.zoom.state())
-        candidates = self._fusions[0].candidates(tracks, self._rig.clock.now())
+        for fusion, search in self._fusions:
+            fusion.update(self.frame, tracks, found.mask, [search])
+            search.states.add(state, self._rig.zoom.state())
+        targets, T_base_fixed = self._fusions[0][0].targets.values(), self._calibration.zoom_head.T_base_fixed
+        candidates = candidates_of(targets, self._rig.clock.now(), T_base_fixed, self._rig.fixed.size)
         number = self._policy.select(candidates, np.array([state.pan, state.tilt]), self._rig.head.limits)
-        self.track = next((track for track in tracks if track.id == number), None)
-        for fusion in self._fusions:
-            fusion.follow(number)
+        self._number = number
+        for fusion, search in self._fusions:
+            search.follow(None if number is None else fusion.targets[number])
 
     def shoot(self) -> Shot | None:
         """Aim at the track for the first zoom frame that can be exposed then, and wait for it; None if out of reach."""
         rate, now = self._config.sim.fixed.rate_hz, self._rig.clock.now()
         still = now + self._rig.spec.head.delay_s + self._config.sim.zoom.exposure_s / 2
         t = (math.floor(still * rate + ROUNDING) + 1) / rate
-        if self.track is None:
+        if self.target is None:
             return None
-        at, then = (self._fusions[-1].estimate(self.track.id, each) for each in (self.frame.t, t))
+        at, then = (self.target.estimate(each) for each in (self.frame.t, t))
         if at is None or then is None:
             return None
         try:
@@ -213,7 +219,7 @@ class _Shooter:
 
     def find_in_zoom(self) -> bool:
         """Search the target in the shot's zoom frame, for the next shot; give whether it was found."""
-        return self._fusions[-1].update_zoom(self._zoom, self.frame.t) is not None
+        return self._fusions[-1][1].update(self._zoom, self.frame.t) is not None
 
     def forget(self) -> None:
         """Drop what the zoom camera has shown."""

@@ -249,7 +249,7 @@ class LoneCamera:
             rig.head.move(command.pan, command.tilt, command.speed)
         exposed = effect + interval
         (pan, tilt), (pan_variance, tilt_variance) = course.at(exposed)
-        (head_pan, _), (head_tilt, _) = self._head_controller.head.at(exposed)
+        (head_pan, _), (head_tilt, _) = self._head_controller.head.predict(exposed)
         scale = math.cos(tilt)
         expected = ExpectedTarget(
             np.array([(pan - head_pan) * scale, head_tilt - tilt]),

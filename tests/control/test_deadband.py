@@ -72,11 +72,11 @@ def follow(name, seed, settings):
         while waiting and waiting[0][0] <= t:
             _, seen_t, seen, view = waiting.pop(0)
             if seen is not None:
-                estimator.update_fixed(seen, seen_t)
+                estimator.add_fixed(seen, seen_t)
             if view is not None:
                 show(estimator, view)
         effect = t + DELAY
-        estimates = [estimator.at(s) for s in (effect, effect + 1 / RATE)]
+        estimates = [estimator.estimate(s) for s in (effect, effect + 1 / RATE)]
         if estimates[0] is None:
             continue
         reach = Reach(LIMITS.pan, LIMITS.tilt, (667.0, 8000.0), head.at(t), STEP)
@@ -190,7 +190,7 @@ def test_a_moving_target_is_followed_at_its_own_speed():
         command = decide(head_controller, t, 0.5 + rate * t, rate)
         commands += [] if command is None else [(t, command)]
         if t > 1.0:
-            at = head_controller.head.at(t)[0][0]
+            at = head_controller.head.predict(t)[0][0]
             assert abs(at - 0.5 - rate * t) < 2 * ZONE
     late = [(t, command) for t, command in commands if t > 1.0]
     ahead_s = HeadSettings().ahead_s
@@ -210,7 +210,7 @@ def test_each_axis_has_its_targets_speed():
         wanted = 0.5 + rates[0] * t, 0.1 + rates[1] * t
         head_controller.decide(t, FRAME, wanted, rates, WIDTH)
     for later in (0.25, 0.5, 0.75):
-        assert [speed for _, speed in head_controller.head.at(t + later * FRAME)] == pytest.approx(rates, abs=0.03)
+        assert [speed for _, speed in head_controller.head.predict(t + later * FRAME)] == pytest.approx(rates, abs=0.03)
 
 
 def test_an_axis_that_stands_is_left_alone_while_the_other_turns():
@@ -240,4 +240,4 @@ def test_a_head_that_jumps_is_sent_to_the_middle_of_the_way():
     head_controller = standing(limits)
     command = decide(head_controller, 0.0, 0.5, 0.4)
     assert (command.pan, command.speed) == (0.5 + 0.4 * FRAME / 2, None)
-    assert head_controller.head.at(0.0)[0] == (command.pan, 0.0)
+    assert head_controller.head.predict(0.0)[0] == (command.pan, 0.0)

@@ -38,7 +38,7 @@ class Unit:
 
     def off(self, t):
         """How far the model is from where the unit really is at a time [rad]."""
-        found = self.model.at(t)
+        found = self.model.predict(t)
         return max(abs(x - axis.motor(t)[0]) for (x, _), axis in zip(found, self.axes, strict=True))
 
 
@@ -62,7 +62,7 @@ def test_a_head_that_obeys_is_known_between_its_reports_and_ahead_of_them(unit):
 def test_a_command_that_is_still_to_take_effect_is_counted_with(unit):
     unit.move(0.1, 0.5, 0.0)
     unit.report(0.04)
-    assert unit.model.at(0.05) == ((0.0, 0.0), (0.0, 0.0))
+    assert unit.model.predict(0.05) == ((0.0, 0.0), (0.0, 0.0))
     assert unit.off(0.3) < 1e-9
     assert unit.model.commanded_t == 0.1
 
@@ -104,7 +104,7 @@ def test_a_head_that_arrives_early_is_not_sent_again(unit):
     unit.model.add_command(0.1, HeadCommand(0.1, 0.0, None))
     unit.model.correct(PanTiltState(0.1, 0.0, False, 0.12))
     assert unit.model.command == HeadCommand(0.1, 0.0, None)
-    assert unit.model.at(0.2) == ((0.1, 0.0), (0.0, 0.0))
+    assert unit.model.predict(0.2) == ((0.1, 0.0), (0.0, 0.0))
 
 
 @pytest.mark.parametrize("goal", [0.4, -0.4, 0.01, 0.0])

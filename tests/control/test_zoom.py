@@ -105,22 +105,22 @@ def test_an_estimate_says_what_to_expect():
     flight = Flight("person", 0, 2.0)
     estimator = TargetFilter(flight.calibration, flight.target)
     for t in flight.times:
-        estimator.update_fixed(flight.wide(t), t)
+        estimator.add_fixed(flight.wide(t), t)
         show(estimator, flight.zoom(t + APART))
     t = flight.times[-1] + 0.2
     pan, tilt = flight.aimed(t)
-    seen = expect(estimator.at(t), pan, tilt, 1700.0, shape=0.26)
+    seen = expect(estimator.estimate(t), pan, tilt, 1700.0, shape=0.26)
     assert np.hypot(*seen.offset) < 4 * math.sqrt(np.trace(seen.covariance)) + 0.01
     distance = np.linalg.norm(flight.path(t) - flight.truth.gamma.inv().translation)
     np.testing.assert_allclose(seen.half, np.array([0.26, 1.0]) * flight.size / 2 / distance, rtol=0.1)
     # Where the head is 2 degrees short of it in pan, it stands that much to the right.
-    short = expect(estimator.at(t), pan - math.radians(2), tilt, 1700.0)
+    short = expect(estimator.estimate(t), pan - math.radians(2), tilt, 1700.0)
     assert short.offset[0] - seen.offset[0] == pytest.approx(math.tan(math.radians(2)), rel=0.05)
     # The farther ahead, the wider.
     focals = [
-        longest_focal(expect(estimator.at(t), *flight.aimed(t), 1700.0, shape=0.26), 0.95, SIZE, RANGE)
+        longest_focal(expect(estimator.estimate(t), *flight.aimed(t), 1700.0, shape=0.26), 0.95, SIZE, RANGE)
         for t in flight.times[-1] + np.array([0.1, 0.5, 1.0])
         if flight.path.x[-1] > t
     ]
     assert (np.diff(focals) < 0).all()
-    assert expect(estimator.at(t), pan + math.pi, tilt, 1700.0) is None
+    assert expect(estimator.estimate(t), pan + math.pi, tilt, 1700.0) is None

@@ -63,8 +63,8 @@ def test_the_depth_of_a_target_clipped_for_a_minute_stays_bounded(name, speed):
     depths, sigmas = [], []
     for t in np.arange(0.0, arrived + 60.0, 1 / RATE):
         box = way.box(lens, t)
-        estimator.update_fixed(box, t)
-        found = estimator.at(t + 0.1)
+        estimator.add_fixed(box, t)
+        found = estimator.estimate(t + 0.1)
         assert np.isfinite(found.state).all()
         sigma = np.sqrt(np.diag(found.state_covariance))
         assert np.linalg.eigvalsh(found.state_covariance / np.outer(sigma, sigma)).min() > 0
@@ -92,8 +92,8 @@ def test_an_unmeasured_velocity_along_the_axis_returns_to_its_prior(name):
     estimator = TargetFilter(calibration, target)
     box = Detection(np.array(calibration.fixed.lens.image_center_px), np.array([60.0, 80.0]), 1.0)
     for i in range(100):
-        estimator.update_fixed(box if i < 25 else replace(box, clipped=True), i / RATE)
-    found = estimator.at(99 / RATE)
+        estimator.add_fixed(box if i < 25 else replace(box, clipped=True), i / RATE)
+    found = estimator.estimate(99 / RATE)
     speed = filter_settings(target).motion.speed
     assert found.depth * math.sqrt(found.state_covariance[5, 5]) == pytest.approx(speed, rel=USUAL_SPEED)
 
@@ -107,25 +107,25 @@ def test_a_clipped_box_is_an_upper_bound_of_the_depth():
         estimator = TargetFilter(calibration, person)
         for i in range(40):
             cut = replace(whole, size_px=whole.size_px * part, clipped=True)
-            estimator.update_fixed(whole if i < 10 else cut, i / RATE)
-        found[part] = estimator.at(39 / RATE).depth
+            estimator.add_fixed(whole if i < 10 else cut, i / RATE)
+        found[part] = estimator.estimate(39 / RATE).depth
     depth = Truth().fixed.fy * person.size / 120.0
     assert found[0.3] == pytest.approx(depth, rel=0.01)
     assert found[0.9] == found[0.3]
     assert 0.9 * depth / 1.4 < found[1.4] < 1.01 * depth / 1.4  # its measured approach goes on for a little
     estimator = TargetFilter(calibration, person)
-    estimator.update_fixed(replace(whole, size_px=whole.size_px / 3, clipped=True), 0.0)
-    assert estimator.at(0.0).state_covariance[2, 2] > 0.9**2  # alone, it measures next to nothing
-    estimator.update_fixed(whole, 1 / RATE)
-    found = estimator.at(1 / RATE)
+    estimator.add_fixed(replace(whole, size_px=whole.size_px / 3, clipped=True), 0.0)
+    assert estimator.estimate(0.0).state_covariance[2, 2] > 0.9**2  # alone, it measures next to nothing
+    estimator.add_fixed(whole, 1 / RATE)
+    found = estimator.estimate(1 / RATE)
     assert abs(math.log(found.depth / depth)) < 4 * math.sqrt(found.state_covariance[2, 2]) < 0.5
 
 
 def test_the_centre_of_a_clipped_box_is_uncertain_by_half_its_sides():
     calibration, size = calibration_of(Truth()), np.array([31.0, 120.0])
     estimator = TargetFilter(calibration, DEFAULT_TARGETS["person"])
-    estimator.update_fixed(Detection(np.array(calibration.fixed.lens.image_center_px), size, 1.0, clipped=True), 0.0)
-    sigma = np.sqrt(np.diag(estimator.at(0.0).state_covariance)[:2])
+    estimator.add_fixed(Detection(np.array(calibration.fixed.lens.image_center_px), size, 1.0, clipped=True), 0.0)
+    sigma = np.sqrt(np.diag(estimator.estimate(0.0).state_covariance)[:2])
     np.testing.assert_allclose(sigma * [Truth().fixed.fx, Truth().fixed.fy], size / 2, rtol=0.05)
 
 
@@ -133,9 +133,9 @@ def test_a_target_that_flies_at_the_camera_keeps_a_positive_depth():
     calibration = calibration_of(Truth())
     estimator, near = TargetFilter(calibration, DEFAULT_TARGETS["bird"]), calibration.fixed.lens.image_center_px
     for i in range(30):  # from 30 m to 1 m in two seconds
-        estimator.update_fixed(Detection(near, np.array([550.0, 100.0]) / (30.0 - i), 1.0), i / RATE)
-    assert 0.1 < estimator.at(30 / RATE).depth < 5.0
-    assert estimator.at(4.0).depth > 0
+        estimator.add_fixed(Detection(near, np.array([550.0, 100.0]) / (30.0 - i), 1.0), i / RATE)
+    assert 0.1 < estimator.estimate(30 / RATE).depth < 5.0
+    assert estimator.estimate(4.0).depth > 0
 
 
 SEEN = State.FOLLOWING, State.UNCONFIRMED  # the formula rig's zoom images show nothing

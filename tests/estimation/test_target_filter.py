@@ -49,8 +49,8 @@ def run(flight, zoom=True, delays=DELAYS, settings=None):
     for t in flight.times:
         seen = flight.wide(t)
         if seen is not None:
-            assert estimator.update_fixed(seen, t)
-            yield t, {delay: estimator.at(t + delay) for delay in delays}
+            assert estimator.add_fixed(seen, t)
+            yield t, {delay: estimator.estimate(t + delay) for delay in delays}
         view = flight.zoom(t + APART) if zoom else None
         if view is not None:
             assert show(estimator, view)
@@ -185,7 +185,7 @@ def measurements(flight):
     for t in flight.times:
         seen, view = flight.wide(t), flight.zoom(t + APART)
         if seen is not None:
-            every.append((t, lambda f, seen=seen, t=t: f.update_fixed(seen, t)))
+            every.append((t, lambda f, seen=seen, t=t: f.add_fixed(seen, t)))
         if view is not None:
             every.append((view.t, lambda f, view=view: show(f, view)))
     return every
@@ -203,8 +203,8 @@ def test_any_permutation_of_the_measurements_gives_the_same_estimate(kind):
         for i in order:
             assert every[i][1](estimator)
             if rng.random() < 0.5:
-                estimator.at(every[i][0])
-        estimates.append([estimator.at(t) for t in (0.7, 1.3, 1.6)])
+                estimator.estimate(every[i][0])
+        estimates.append([estimator.estimate(t) for t in (0.7, 1.3, 1.6)])
     for found in estimates[1:]:
         for a, b in zip(estimates[0], found, strict=True):
             np.testing.assert_allclose(b.state, a.state, rtol=0, atol=SAME)
@@ -218,35 +218,35 @@ def test_reading_changes_nothing():
         assert give(read)
         assert give(unread)
         for later in np.linspace(-2.0, 1.0, 20):
-            read.at(t + later)
+            read.estimate(t + later)
             read.knows(t + later)
-    np.testing.assert_array_equal(read.at(2.1).state, unread.at(2.1).state)
-    np.testing.assert_array_equal(read.at(2.1).state_covariance, unread.at(2.1).state_covariance)
+    np.testing.assert_array_equal(read.estimate(2.1).state, unread.estimate(2.1).state)
+    np.testing.assert_array_equal(read.estimate(2.1).state_covariance, unread.estimate(2.1).state_covariance)
 
 
 def test_a_measurement_older_than_the_history_is_refused():
     flight = Flight("person", 0, 4.0)
     estimator = TargetFilter(flight.calibration, flight.target)
     for t in flight.times:
-        estimator.update_fixed(flight.wide(t), t)
-    before = estimator.at(4.0).state
-    assert not estimator.update_fixed(flight.wide(1.0), 1.0)
-    np.testing.assert_array_equal(estimator.at(4.0).state, before)
-    assert estimator.at(1.0) is None
-    assert estimator.at(3.0).measured_t <= 3.0
+        estimator.add_fixed(flight.wide(t), t)
+    before = estimator.estimate(4.0).state
+    assert not estimator.add_fixed(flight.wide(1.0), 1.0)
+    np.testing.assert_array_equal(estimator.estimate(4.0).state, before)
+    assert estimator.estimate(1.0) is None
+    assert estimator.estimate(3.0).measured_t <= 3.0
 
 
 def test_there_is_no_estimate_before_the_first_detection_in_the_fixed_image():
     flight = Flight("person", 0, 1.0)
     estimator = TargetFilter(flight.calibration, flight.target)
-    assert estimator.at(0.0) is None
+    assert estimator.estimate(0.0) is None
     show(estimator, flight.zoom(0.0))
-    assert estimator.at(1.0) is None
-    assert not estimator.update_fixed(flight.wide(0.0), math.nan)
-    assert not estimator.update_fixed(Detection(np.array([np.nan, 1.0]), np.array([5.0, 5.0]), 1.0), 0.0)
-    assert estimator.update_fixed(flight.wide(0.0), 0.0)
-    assert np.isfinite(estimator.at(0.5).state).all()
-    assert not estimator.update_fixed(flight.wide(0.0), 0.0)  # the same frame again
+    assert estimator.estimate(1.0) is None
+    assert not estimator.add_fixed(flight.wide(0.0), math.nan)
+    assert not estimator.add_fixed(Detection(np.array([np.nan, 1.0]), np.array([5.0, 5.0]), 1.0), 0.0)
+    assert estimator.add_fixed(flight.wide(0.0), 0.0)
+    assert np.isfinite(estimator.estimate(0.5).state).all()
+    assert not estimator.add_fixed(flight.wide(0.0), 0.0)  # the same frame again
 
 
 # ---------------------------------------------------------------- outliers and wrong beliefs
@@ -259,11 +259,11 @@ def test_one_outlier_changes_little(camera):
         give(hit)
     t = flight.times[-1] + 0.02
     if camera == "fixed":
-        hit.update_fixed(Detection(np.array([40.0, 400.0]), np.array([90.0, 90.0]), 1.0), t)
+        hit.add_fixed(Detection(np.array([40.0, 400.0]), np.array([90.0, 90.0]), 1.0), t)
     else:
         view = flight.zoom(t)
         show(hit, replace(view, pixel=view.pixel + np.array([250.0, -180.0])))
-    a, b = clean.at(t + 0.2), hit.at(t + 0.2)
+    a, b = clean.estimate(t + 0.2), hit.estimate(t + 0.2)
     assert (np.abs(a.state - b.state) < 0.1 * np.sqrt(np.diag(a.state_covariance)) + EXACT).all()
 
 
@@ -273,10 +273,10 @@ def test_a_measurement_of_unknown_error_changes_nothing():
     for t in flight.times:
         seen = flight.wide(t)
         for estimator in (clean, hit):
-            estimator.update_fixed(seen, t)
-        hit.update_fixed(seen, t + 0.01, sigma_px=np.full(2, np.nan))
-        hit.update_zoom(np.zeros(2), np.nan, 0.0, 0.0, NOMINAL_PX, t + 0.02)
-    a, b = clean.at(1.5), hit.at(1.5)
+            estimator.add_fixed(seen, t)
+        hit.add_fixed(seen, t + 0.01, sigma_px=np.full(2, np.nan))
+        hit.add_zoom(np.zeros(2), np.nan, 0.0, 0.0, NOMINAL_PX, t + 0.02)
+    a, b = clean.estimate(1.5), hit.estimate(1.5)
     # Two predictions in place of one differ a little.
     np.testing.assert_allclose(b.state, a.state, atol=0.1 * np.sqrt(np.diag(a.state_covariance)).max())
 
@@ -287,8 +287,8 @@ def test_a_detector_noisier_than_assumed_is_no_motion():
     rng = np.random.default_rng(4)
     estimator, still, fastest = TargetFilter(flight.calibration, flight.target), flight.wide(0.0), 0.0
     for t in np.arange(0.0, 20.0, 1 / RATE):
-        estimator.update_fixed(replace(still, center_px=still.center_px + rng.normal(0.0, 0.5, 2)), t)
-        found = estimator.at(t)
+        estimator.add_fixed(replace(still, center_px=still.center_px + rng.normal(0.0, 0.5, 2)), t)
+        found = estimator.estimate(t)
         fastest = max(fastest, found.depth * float(np.linalg.norm(found.state[3:5])) if t > 1 else 0.0)
     assert fastest < 1.0  # as a jump in each frame it would be several metres a second
 
@@ -297,13 +297,13 @@ def test_a_target_that_jumps_is_accepted_there():
     flight = Flight("book", 3, 2.0)
     estimator = TargetFilter(flight.calibration, flight.target)
     for t in flight.times:
-        estimator.update_fixed(flight.wide(t), t)
+        estimator.add_fixed(flight.wide(t), t)
     seen = flight.wide(2.0)
     moved = Detection(seen.center_px + np.array([60.0, 20.0]), seen.size_px * 1.3, 1.0)
     depth = depth_of(flight.calibration, flight.target, moved.size_px[0], moved.center_px)
     for i in range(6):
-        estimator.update_fixed(moved, 2.0 + i / RATE)
-    found = estimator.at(2.0 + 5 / RATE)
+        estimator.add_fixed(moved, 2.0 + i / RATE)
+    found = estimator.estimate(2.0 + 5 / RATE)
     there = point_at(flight.calibration, moved.center_px, depth)
     assert np.linalg.norm(found.x_fixed[:2] - there[:2]) < 0.02
     assert found.depth == pytest.approx(depth, rel=0.05)
@@ -330,7 +330,7 @@ def test_a_head_that_points_wrongly_is_corrected_without_oscillation(delay):
     lens, waiting, offsets = magnified(flight.truth, NOMINAL), [], []
     for t in flight.times:
         waiting.append((t, flight.wide(t), None))
-        found = estimator.at(t)
+        found = estimator.estimate(t)
         if found is not None:
             solved = aim(flight.calibration, found.x_fixed, ANYWHERE, nominal_px=NOMINAL)
             pan, tilt = solved.pan - found.bias[0], solved.tilt - found.bias[1]
@@ -340,7 +340,7 @@ def test_a_head_that_points_wrongly_is_corrected_without_oscillation(delay):
         while waiting and waiting[0][0] <= t - delay + EXACT:
             seen_t, seen, view = waiting.pop(0)
             if seen is not None:
-                estimator.update_fixed(seen, seen_t)
+                estimator.add_fixed(seen, seen_t)
             if view is not None:
                 show(estimator, view)
     off = np.array(offsets)
@@ -367,16 +367,16 @@ def test_a_covariance_stays_positive_over_a_minute_out_of_sight():
     for _, give in measurements(flight):
         give(estimator)
     for ahead in (0.0, 1.0, 10.0, 60.0):
-        found = estimator.at(3.0 + ahead)
+        found = estimator.estimate(3.0 + ahead)
         assert np.isfinite(found.state).all()
         assert np.linalg.eigvalsh(found.state_covariance).min() > 0
-    assert estimator.update_fixed(flight.wide(0.2), 20.0)
+    assert estimator.add_fixed(flight.wide(0.2), 20.0)
     there = flight.path(0.2)
-    assert np.abs(estimator.at(20.0).state[:2] - there[:2] / there[2]).max() < 0.02
+    assert np.abs(estimator.estimate(20.0).state[:2] - there[:2] / there[2]).max() < 0.02
 
 
 def centre_variance(estimator, t):
-    return np.diag(estimator.at(t).state_covariance)[:2]
+    return np.diag(estimator.estimate(t).state_covariance)[:2]
 
 
 def test_a_given_error_of_a_centre_holds_though_its_box_is_clipped():
@@ -384,7 +384,7 @@ def test_a_given_error_of_a_centre_holds_though_its_box_is_clipped():
     seen, variances = flight.wide(0.0), []
     for clipped in (False, True):
         estimator = TargetFilter(flight.calibration, flight.target)
-        estimator.update_fixed(replace(seen, clipped=clipped), 0.0, sigma_px=np.array([2.0, 3.0]))
+        estimator.add_fixed(replace(seen, clipped=clipped), 0.0, sigma_px=np.array([2.0, 3.0]))
         variances.append(centre_variance(estimator, 0.0))
     np.testing.assert_allclose(variances[1], variances[0], rtol=EXACT)
 
@@ -395,22 +395,22 @@ def test_two_frames_give_a_velocity_and_a_third_that_errs_alike_adds_little(afte
     settings = filter_settings(flight.target)
     estimator = TargetFilter(flight.calibration, flight.target)
     seen, t, dt = flight.wide(0.0), 0.0, 1.0 / RATE
-    estimator.update_fixed(seen, t)
+    estimator.add_fixed(seen, t)
     if after_jump:
         seen = replace(seen, center_px=seen.center_px + JUMP_PX)
         for _ in range(settings.misses):
             t += dt
-            estimator.update_fixed(seen, t)
+            estimator.add_fixed(seen, t)
     first = np.sqrt(centre_variance(estimator, t))
     t += dt
-    estimator.update_fixed(seen, t)
-    estimate = estimator.at(t)
+    estimator.add_fixed(seen, t)
+    estimate = estimator.estimate(t)
     found, (a, b) = estimate.state_covariance, estimate.state[:2]
     by_velocity = np.array([[1.0, 0.0, -a], [0.0, 1.0, -b]])  # of the tangents' rates
     rates = np.sqrt(np.diag(by_velocity @ found[3:6, 3:6] @ by_velocity.T))
     assert (rates < AS_TWO * math.sqrt(2.0) * first / dt).all()
     t += SOON * settings.noise_s
-    estimator.update_fixed(seen, t)
+    estimator.add_fixed(seen, t)
     assert (centre_variance(estimator, t) > HARDLY * np.diag(found)[:2]).all()
 
 
@@ -452,7 +452,7 @@ def test_a_height_appears_by_the_vertical_focal_length(name, focal):
     lens, still = Intrinsics((641, 481), (500.0, 1000.0), (320.0, 240.0)), RigidTransform.identity()
     head = ZoomHead(ZoomLens((500.0,), (lens,)), still, still)
     estimator = TargetFilter(Calibration(FixedCamera(lens), head), DEFAULT_TARGETS[name])
-    assert estimator.update_fixed(Detection(np.array([320.0, 240.0]), np.array([50.0, 40.0]), 1.0), 0.0)
-    found = estimator.at(0.0)
+    assert estimator.add_fixed(Detection(np.array([320.0, 240.0]), np.array([50.0, 40.0]), 1.0), 0.0)
+    found = estimator.estimate(0.0)
     seen = found.appearance(0.0, 0.0, 500.0)
     assert seen.size_px == pytest.approx(focal * found.wanted_size.size / found.depth, rel=EXACT)

@@ -108,7 +108,7 @@ class Scene:
 
     def finder(self):
         finder = CloseupFinder(self.calibration, BIRD)
-        finder.update_fixed(*self.fixed())
+        finder.store(*self.fixed())
         return finder
 
     def error(self, found, finder=None):
@@ -168,7 +168,7 @@ def test_a_zoom_stream_of_half_the_size_is_registered():
     scene = Scene([(1.5, -1.0, 20.0)])
     half = Frame(cv2.resize(scene.zoom().image, (320, 240), interpolation=cv2.INTER_AREA), 0.0)
     finder = CloseupFinder(scene.calibration.for_streams(SIZE, (320, 240)), BIRD)
-    finder.update_fixed(*scene.fixed())
+    finder.store(*scene.fixed())
     found = finder.find(half, dataclasses.replace(scene.expected(), nominal_px=scene.nominal / 2))
     assert found is not None
     doubled = dataclasses.replace(found, center_px=(found.center_px + 0.5) * 2 - 0.5)
@@ -191,7 +191,7 @@ def test_the_fixed_frame_nearest_in_time_is_registered_and_an_old_one_is_not():
     zoom = scene.zoom(t=1.0)
     assert finder.find(zoom, scene.expected()) is None
     for t in (0.8, 0.94, 0.98, 1.03):
-        finder.update_fixed(Frame(frame.image, t), detection, mask)
+        finder.store(Frame(frame.image, t), detection, mask)
     assert finder.fixed_view_at(1.0).t == 0.98
     assert finder.find(zoom, scene.expected()).t == 1.0
     assert finder.fixed_view_at(1.2) is None
@@ -203,7 +203,7 @@ def test_a_target_without_foreground_is_registered_by_its_box():
     frame, detection, mask = scene.fixed()
     for nothing in (None, np.zeros_like(mask)):
         finder = CloseupFinder(scene.calibration, BIRD)
-        finder.update_fixed(frame, detection, nothing)
+        finder.store(frame, detection, nothing)
         found = finder.find(scene.zoom(), scene.expected())
         assert found is not None
         assert scene.error(found, finder) < REGISTERED_PX
@@ -215,7 +215,7 @@ def test_a_clipped_box_has_an_uncertain_body_centre():
     sigmas = []
     for clipped in (False, True):
         finder = CloseupFinder(scene.calibration, BIRD)
-        finder.update_fixed(frame, dataclasses.replace(detection, clipped=clipped), mask)
+        finder.store(frame, dataclasses.replace(detection, clipped=clipped), mask)
         sigmas.append(finder.find(scene.zoom(), scene.expected()).body_sigma_px)
     assert (sigmas[1] > 0.45 * detection.size_px * scene.nominal / FOCAL).all()
     assert (sigmas[1] > 2 * sigmas[0]).all()
@@ -233,7 +233,7 @@ def test_boxes_at_and_beyond_the_border_are_not_registered(center):
     scene = Scene([(1.5, -1.0, 20.0)])
     frame, detection, mask = scene.fixed()
     finder = CloseupFinder(scene.calibration, BIRD)
-    finder.update_fixed(frame, dataclasses.replace(detection, center_px=np.array(center)), mask)
+    finder.store(frame, dataclasses.replace(detection, center_px=np.array(center)), mask)
     assert finder.find(scene.zoom(), scene.expected()) is None
 
 
@@ -270,7 +270,7 @@ def test_rendered_targets_are_registered_from_the_shortest_focal_length_to_the_l
         mask = (np.abs(fixed.image.astype(int) - nothing.image).max(axis=2) > 25).astype(np.uint8)
         outline = truth.silhouette(name, "fixed", t)
         box = Detection((outline.low_px + outline.high_px) / 2, outline.size_px, 0.9)
-        fixed_view = finder.update_fixed(fixed, box, mask)
+        fixed_view = finder.store(fixed, box, mask)
         # The expected depth is wrong by a twentieth.
         head, lens = truth.head_at(t), truth.nominal_at(t)
         found = finder.find(zoom, Expected(x_fixed * 1.05, 30.0**2 * np.eye(2), *head, lens))

@@ -308,7 +308,7 @@ class Asked:
     def __init__(self):
         self.times = []
 
-    def update_fixed(self, frame, detection, mask=None):
+    def store(self, frame, detection, mask=None):
         del frame, detection, mask
 
     def fixed_view_at(self, t):

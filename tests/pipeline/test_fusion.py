@@ -12,14 +12,18 @@ import pytest
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
+from cotarget.control.selection import FirstCome, candidates_of
 from cotarget.detection import Detection
 from cotarget.estimation.zoom_matching import CloseupFinder, MatchingSettings, ZoomMeasurement
-from cotarget.fusion import FusionSettings, TargetFusion
+from cotarget.fusion import FusionSettings, TargetFusion, ZoomSearch
 from cotarget.geometry import pose
+from cotarget.pipeline import FollowSettings, HeadRun
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
+from tests.support.formula_rig import FormulaRig
+from tests.support.rigs import rig_of
 
 SIZE, CENTER, FOCAL, ZOOMED = (640, 480), (319.5, 239.5), 700.0, 3000.0
 BASELINE = 0.4
@@ -51,41 +55,63 @@ def track(number, box, t=0.0, *, missed=0, confirmed=True, larger=None):
     return Track(number, t, confirmed, missed, box.center_px, still, box.size_px, side, np.eye(4), 1.0, box)
 
 
-def show(fusion, t, tracks, **more):
-    fusion.update_fixed(Frame(IMAGE, t), tracks, None, **more)
+class Pair:
+    """Both cameras' measurements, of targets by their numbers; one may be followed in the zoom image."""
+
+    def __init__(self, profile, finder=None, followed=None, **how):
+        make = None if finder is None else lambda calibration, profile: finder
+        self.fusion, self.search = (
+            TargetFusion(CALIBRATION, profile),
+            ZoomSearch(CALIBRATION, profile, finder=make, **how),
+        )
+        self.followed = followed
+
+    def show(self, t, tracks, favoured=()):
+        self.fusion.update(Frame(IMAGE, t), tracks, None, [self.search], favoured)
+        self.search.follow(self.fusion.targets.get(self.followed))
+
+    def estimate(self, number, t):
+        target = self.fusion.targets.get(number)
+        return target and target.estimate(t)
+
+    def candidates(self, t):
+        return candidates_of(self.fusion.targets.values(), t, CALIBRATION.zoom_head.T_base_fixed, SIZE)
+
+    def warnings(self, t):
+        return self.search.warnings(self.estimate(self.followed, t))
 
 
 def seen(fusion, tracks_at, frames):
     """Show some frames; return the time of the last one."""
     for i in range(frames):
-        show(fusion, i * FRAME_S, tracks_at(i * FRAME_S))
+        fusion.show(i * FRAME_S, tracks_at(i * FRAME_S))
     return (frames - 1) * FRAME_S
 
 
 def report(fusion, t, pan=0.0, nominal=ZOOMED):
     """Head and lens report their state."""
-    fusion.states.add(PanTiltState(pan, 0.0, False, t), ZoomState(nominal, False, t))
+    fusion.search.states.add(PanTiltState(pan, 0.0, False, t), ZoomState(nominal, False, t))
 
 
 # ---------------------------------------------------------------- filters of tracks
 def test_a_track_has_an_estimate_as_long_as_it_lives():
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion = Pair(BOOK)
     assert fusion.estimate(1, 0.0) is None
     both = [track(1, box_at(1.0, 0.5, 10.0)), track(2, box_at(-1.0, 0.0, 8.0))]
     t = seen(fusion, lambda t: both, 10)
     np.testing.assert_allclose(fusion.estimate(1, t).x_fixed, (1.0, 0.5, 10.0), rtol=0.02)
     np.testing.assert_allclose(fusion.estimate(2, t).x_fixed, (-1.0, 0.0, 8.0), rtol=0.02, atol=1e-6)
-    show(fusion, t + FRAME_S, both[1:])
+    fusion.show(t + FRAME_S, both[1:])
     assert fusion.estimate(1, t) is None
     assert fusion.estimate(2, t) is not None
 
 
 def test_a_missed_track_measures_nothing():
     """Its box is an old one, at another place."""
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion = Pair(BOOK)
     t = seen(fusion, lambda t: [track(1, box_at(1.0, 0.0, 10.0), t)], 5)
     before = fusion.estimate(1, t + 1)
-    show(fusion, t + 1, [track(1, box_at(3.0, 0.0, 10.0), t + 1, missed=1)])
+    fusion.show(t + 1, [track(1, box_at(3.0, 0.0, 10.0), t + 1, missed=1)])
     after = fusion.estimate(1, t + 1)
     assert (after.state == before.state).all()
     assert after.measured_t == t
@@ -95,7 +121,7 @@ def test_the_size_of_a_wingspan_is_the_largest_side_over_a_beat():
     """The same boxes with twice the largest side are of a bird at half the distance."""
     depths, box = [], Detection(np.array([320.0, 240.0]), np.array([12.0, 8.0]), 1.0)
     for larger in (20.0, 40.0):
-        fusion = TargetFusion(CALIBRATION, BIRD, SIZE)
+        fusion = Pair(BIRD)
         t = seen(fusion, lambda t, larger=larger: [track(1, box, t, larger=larger)], 20)
         depths.append(fusion.estimate(1, t).depth)
     assert depths[0] == pytest.approx(2 * depths[1], rel=0.01)
@@ -126,19 +152,19 @@ MOST = FusionSettings.most_filters
     ids=["first", "with a filter already", "confirmed"],
 )
 def test_of_a_crowd_the_most_important_have_filters(first, then, expected):
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
-    show(fusion, 0.0, first)
-    show(fusion, FRAME_S, then)
+    fusion = Pair(BOOK)
+    fusion.show(0.0, first)
+    fusion.show(FRAME_S, then)
     assert known(fusion, FRAME_S) == set(expected)
     assert all(fusion.estimate(n, FRAME_S).measured_t == FRAME_S for n in expected)
 
 
 def test_the_followed_and_the_favoured_have_filters_before_others():
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
-    show(fusion, 0.0, crowd(range(1, 101)), favoured={90})
+    fusion = Pair(BOOK)
+    fusion.show(0.0, crowd(range(1, 101)), favoured={90})
     assert known(fusion) == {*range(1, MOST), 90}
-    fusion.follow(5)
-    show(fusion, FRAME_S, crowd(range(1, 101), FRAME_S), favoured=set(range(20, 60)))
+    fusion.search.follow(fusion.fusion.targets[5])
+    fusion.show(FRAME_S, crowd(range(1, 101), FRAME_S), favoured=set(range(20, 60)))
     assert known(fusion, FRAME_S) == {5, *range(20, 20 + MOST - 1)}
 
 
@@ -157,7 +183,7 @@ class Finder:
         self.off_px = ZOOMED * np.array([-bias[0], bias[1]])  # of a head that points farther right and up
         self.shown, self.asked = {}, []
 
-    def update_fixed(self, frame, detection, mask):
+    def store(self, frame, detection, mask):
         self.shown[frame.t] = detection.size_px
 
     def fixed_view_at(self, t):
@@ -177,9 +203,8 @@ class Finder:
 
 def test_two_targets_that_cross_are_predicted_through_their_shared_box():
     """While both are one box, the last box of each is at least 6 px and one frame old."""
-    tracker, fusion = Tracker(tracking_settings(PERSON), SIZE), TargetFusion(CALIBRATION, PERSON, SIZE)
-    fusion.follow(1)
-    fusion.search.finder, merged, worst = Finder(), [], 0.0
+    tracker, fusion = Tracker(tracking_settings(PERSON), SIZE), Pair(PERSON, Finder(), followed=1)
+    merged, worst = [], 0.0
     for i in range(100):
         t = i * FRAME_S
         centers, size = crossing_persons(t)
@@ -187,7 +212,7 @@ def test_two_targets_that_cross_are_predicted_through_their_shared_box():
         if abs(centers[0, 0] - centers[1, 0]) <= size[0]:
             merged.append(t)
             boxes = [Detection(np.array(CENTER), size + np.abs(centers[0] - centers[1]), 1.0)]
-        show(fusion, t, tracker.update(boxes, t))
+        fusion.show(t, tracker.update(boxes, t))
         for number in (1, 2) if t > 1.0 else ():
             found = fusion.estimate(number, t + 0.2)
             at = CENTER + FOCAL * found.x_fixed[:2] / found.x_fixed[2]
@@ -205,51 +230,58 @@ def test_a_larger_shared_box_moves_the_estimate_less():
     """Two targets stand as one box, and the track has drifted by 10 px."""
 
     def pulled(around):
-        fusion = TargetFusion(CALIBRATION, PERSON, SIZE)
+        fusion = Pair(PERSON)
         own = Detection(np.array(CENTER), np.array([28.0, 122.5]), 1.0)
         t = seen(fusion, lambda t: [track(1, own, t)], 25) + FRAME_S
         aside = track(1, replace(own, center_px=np.add(CENTER, (10.0, 0.0))), t)
-        show(fusion, t, [replace(aside, box=replace(own, size_px=np.array([around, 122.5])), shared=True)])
+        fusion.show(t, [replace(aside, box=replace(own, size_px=np.array([around, 122.5])), shared=True)])
         return FOCAL * fusion.estimate(1, t).x_fixed[0] / 10.0
 
     assert 0 < pulled(100.0) < pulled(40.0) < 1.0
 
 
 def test_a_box_of_a_part_of_the_target_measures_no_size():
-    fusion = TargetFusion(CALIBRATION, PERSON, SIZE)
+    fusion = Pair(PERSON)
     whole = Detection(np.array(CENTER), np.array([28.0, 122.5]), 1.0)
     t = seen(fusion, lambda t: [track(1, whole, t)], 25)
     part = replace(whole, size_px=np.array([28.0, 61.0]))
     for _ in range(10):
         t += FRAME_S
-        show(fusion, t, [replace(track(1, whole, t), box=part)])
+        fusion.show(t, [replace(track(1, whole, t), box=part)])
     assert fusion.estimate(1, t).depth == pytest.approx(10.0, rel=DEPTH)
 
 
 # ---------------------------------------------------------------- candidates for selection
 def test_candidates_have_directions_and_rates_as_the_head_sees_them():
     """At 2 m/s to the right, 10 m away: seen from 0.4 m to the right, the middle of the view is to the left."""
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion = Pair(BOOK)
     t = seen(fusion, lambda t: [track(1, box_at(2.0 * t - 2.0, -1.0, 10.0), t)], 26)
-    (found,) = fusion.candidates([track(1, box_at(0.0, -1.0, 10.0), t)], t)
+    (found,) = fusion.candidates(t)
     now, later = (math.atan2(x - BASELINE, 10.0) for x in (0.0, 2.0))
     assert found.at[0] == pytest.approx(now, abs=2e-3)
     assert found.at[1] == pytest.approx(math.atan2(1.0, math.hypot(BASELINE, 10.0)), rel=DEPTH)  # up
     assert found.rate[0] == pytest.approx(later - now, rel=SPEED)
 
 
+def looking(profile=BOOK):
+    """A run of the head and its lens, which zooms to `ZOOMED`, and the fusion."""
+    rig = rig_of(FormulaRig(focal_range=(FOCAL, ZOOMED)))
+    fusion, run = Pair(profile), HeadRun(rig, CALIBRATION, profile, FirstCome(), FollowSettings())
+    fusion.search = run.search
+    return fusion, run
+
+
 def test_candidates_are_confirmed_tracks_with_their_time_in_the_close_up():
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion, run = looking()
     tracks = [track(n, box_at(float(n), 0.0, 10.0), confirmed=n < 3) for n in (1, 2, 3)]
-    show(fusion, 0.0, tracks)
+    fusion.show(0.0, tracks)
     report(fusion, 0.0, pan=math.atan2(2.0 - BASELINE, 10.0))
     for _ in range(3):
-        fusion.count_seen_well(tracks[1], 0.5, ZOOMED)
-    unknown = track(4, box_at(0.0, 0.0, 10.0))
-    assert {each.track.id: each.seen_s for each in fusion.candidates([*tracks, unknown], 0.0)} == {1: 0.0, 2: 1.5}
-    show(fusion, FRAME_S, tracks[:1])  # it is gone ...
-    show(fusion, 2 * FRAME_S, tracks)  # ... and another has its number
-    assert {each.seen_s for each in fusion.candidates(tracks, 2 * FRAME_S)} == {0.0}
+        run.count_seen_well(fusion.fusion.targets[2], 0.5)
+    assert {each.track.id: each.seen_s for each in fusion.candidates(0.0)} == {1: 0.0, 2: 1.5}
+    fusion.show(FRAME_S, tracks[:1])  # it is gone ...
+    fusion.show(2 * FRAME_S, tracks)  # ... and another has its number
+    assert {each.seen_s for each in fusion.candidates(2 * FRAME_S)} == {0.0}
 
 
 @pytest.mark.parametrize(("pan", "nominal", "well"), [
@@ -260,15 +292,15 @@ def test_candidates_are_confirmed_tracks_with_their_time_in_the_close_up():
     (0.11, ZOOMED, False),  # of 0.107 to the border half the book is 0.012
 ])  # fmt: skip
 def test_a_target_is_seen_well_inside_the_close_up_and_as_large_as_wanted(pan, nominal, well):
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion, run = looking()
     box = box_at(BASELINE, 0.0, 10.0)
     t = seen(fusion, lambda t: [track(1, box, t)], 20)
+    target = fusion.fusion.targets[1]
 
     def counted(missed=0, t=t):
-        there = track(1, box, t, missed=missed)
-        before = fusion.candidates([there], t)[0].seen_s
-        fusion.count_seen_well(there, 0.5, ZOOMED)
-        return fusion.candidates([there], t)[0].seen_s - before
+        before, target.track = target.seen_well_s, track(1, box, t, missed=missed)
+        run.count_seen_well(target, 0.5)
+        return target.seen_well_s - before
 
     assert counted() == 0.0  # head and lens have not reported yet
     for when in (t, t + 1.0):
@@ -283,16 +315,13 @@ def followed(finder, x_fixed=X, wrong=1.0, frames=40, shake=0.0, **how):
 
     The head points straight ahead at each frame, and `shake` [rad] to the left between two frames.
     """
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE, **how)
-    fusion.follow(1)
-    fusion.search.finder = finder
-    found = []
+    fusion, found = Pair(BOOK, finder, followed=1, **how), []
     for i in range(frames):
         t = i * FRAME_S
-        show(fusion, t, [track(1, box_at(*x_fixed, wrong=wrong), t)])
+        fusion.show(t, [track(1, box_at(*x_fixed, wrong=wrong), t)])
         report(fusion, t - FRAME_S / 2, pan=-shake)
         report(fusion, t)
-        found.append(fusion.update_zoom(Frame(IMAGE, t), t))
+        found.append(fusion.search.update(Frame(IMAGE, t), t))
     return fusion, found, t
 
 
@@ -327,24 +356,24 @@ def test_the_zoom_image_is_searched_at_the_heads_angles_plus_their_bias():
 
 
 def test_the_zoom_image_is_not_searched_without_a_target_and_a_pose():
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
-    fusion.search.finder = Finder()
-    show(fusion, 0.0, [track(1, box_at(*X))])
-    assert fusion.update_zoom(Frame(IMAGE, 0.0), 0.0) is None  # nothing is followed, no pose is known
+    fusion = Pair(BOOK, Finder())
+    fusion.show(0.0, [track(1, box_at(*X))])
+    assert fusion.search.update(Frame(IMAGE, 0.0), 0.0) is None  # nothing is followed, no pose is known
     report(fusion, 0.0)
-    assert fusion.update_zoom(Frame(IMAGE, 0.0), 0.0) is None
-    fusion.follow(1)
-    fusion.search.finder = Finder()
-    assert fusion.update_zoom(Frame(IMAGE, 0.0), 0.0) is not None
+    assert fusion.search.update(Frame(IMAGE, 0.0), 0.0) is None
+    fusion.search.follow(fusion.fusion.targets[1])
+    assert fusion.search.update(Frame(IMAGE, 0.0), 0.0) is not None
 
 
 def test_another_target_has_another_finder():
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
-    fusion.follow(1)
+    fusion = Pair(BOOK)
+    fusion.show(0.0, crowd((1, 2)))
+    first, second = fusion.fusion.targets.values()
+    fusion.search.follow(first)
     finder = fusion.search.finder
-    fusion.follow(1)
+    fusion.search.follow(first)
     assert fusion.search.finder is finder
-    fusion.follow(2)
+    fusion.search.follow(second)
     assert fusion.search.finder is not finder
 
 
@@ -352,13 +381,11 @@ def test_the_finder_measures_the_centre_of_the_followed_body():
     """A track's box may lie beside the body."""
 
     class Beside(Finder):
-        def update_fixed(self, frame, detection, mask):
+        def store(self, frame, detection, mask):
             return type("View", (), {"body_px": detection.center_px + 5.0, "body_sigma_px": np.full(2, 0.1)})
 
     box = box_at(0.0, 0.0, 10.0)
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
-    fusion.follow(1)
-    fusion.search.finder = Beside()
+    fusion = Pair(BOOK, Beside(), followed=1)
     t = seen(fusion, lambda t: [track(1, box, t), track(2, replace(box), t)], 10)
     ours, other = (fusion.estimate(n, t).x_fixed for n in (1, 2))
     assert ours[0] * FOCAL / ours[2] == pytest.approx(5.0, abs=0.05)
@@ -370,9 +397,9 @@ def test_the_depth_is_that_of_a_person_whose_hand_came_first():
     hand = Detection(np.array([600.0, 240.0]), np.array([10.0, 10.0]), 1.0)
     clipped = Detection(np.array([620.0, 240.0]), np.array([40.0, 122.0]), 1.0, clipped=True)
     whole = Detection(np.array([600.0, 240.0]), np.array([50.0, FOCAL * PERSON.size / 10]), 1.0)
-    fusion, depths = TargetFusion(CALIBRATION, PERSON, SIZE), []
+    fusion, depths = Pair(PERSON), []
     for i, box in enumerate([hand] * 3 + [clipped] * 3 + [whole] * 3):
-        show(fusion, i * FRAME_S, [track(1, box, i * FRAME_S)])
+        fusion.show(i * FRAME_S, [track(1, box, i * FRAME_S)])
         depths.append(fusion.estimate(1, i * FRAME_S).x_fixed[2])
     assert depths[2] > 50
     assert max(depths[3:]) < 15
@@ -381,10 +408,10 @@ def test_the_depth_is_that_of_a_person_whose_hand_came_first():
 
 def test_a_bird_that_comes_near_keeps_its_velocity():
     """From 4 px to 40 px in 2 s, across the image at 100 px a second: it was always the bird."""
-    fusion, off = TargetFusion(CALIBRATION, BIRD, SIZE), []
+    fusion, off = Pair(BIRD), []
     for i in range(51):
         t, side = i * FRAME_S, 4.0 * 10 ** (i / 50)
-        show(fusion, t, [track(1, Detection(np.array([200 + 100 * t, 240.0]), np.array([side, side]), 1.0), t)])
+        fusion.show(t, [track(1, Detection(np.array([200 + 100 * t, 240.0]), np.array([side, side]), 1.0), t)])
         ahead = fusion.estimate(1, t + 0.2).x_fixed
         off.append(CENTER[0] + FOCAL * ahead[0] / ahead[2] - (220 + 100 * t))
     assert np.abs(off[10:]).max() < 2
@@ -396,14 +423,12 @@ def test_a_standing_body_without_its_feet_in_one_frame_stays_where_it_is():
     cut = replace(usual, center_px=usual.center_px - (0, 6), size_px=np.array([50.0, 108.0]))
 
     class Exact(Finder):
-        def update_fixed(self, frame, detection, mask):
+        def store(self, frame, detection, mask):
             return type("View", (), {"body_px": detection.center_px, "body_sigma_px": np.array([1.5, 0.7])})
 
-    fusion = TargetFusion(CALIBRATION, PERSON, SIZE)
-    fusion.follow(1)
-    fusion.search.finder = Exact()
+    fusion = Pair(PERSON, Exact(), followed=1)
     t = seen(fusion, lambda t: [track(1, usual, t)], 20) + FRAME_S
-    show(fusion, t, [replace(track(1, usual, t), box=cut)])
+    fusion.show(t, [replace(track(1, usual, t), box=cut)])
     x = fusion.estimate(1, t).x_fixed
     assert abs(x[1] * FOCAL / x[2]) < 0.3
 
@@ -416,21 +441,20 @@ def test_a_target_not_found_where_expected_is_reported_and_then_searched_farther
     """Its nominal size is 15 % too small: at 10 m, 0.4 m beside, that is 21 px of 3000."""
     fusion, found, t = followed(Finder(gate=9.0), wrong=1.15, frames=UNFOUND)
     assert found[:-2] == [None] * (UNFOUND - 2)
-    (text,) = fusion.warnings(1, fusion.estimate(1, t))
+    (text,) = fusion.warnings(t)
     assert text.startswith("for 1.5 s not found where the zoom camera should show it")
-    assert fusion.warnings(2, fusion.estimate(2, t)) == []
     fusion, found, t = followed(Finder(gate=9.0), wrong=1.15, frames=UNFOUND + 30)
     assert all(each is not None for each in found[-20:])
-    (text,) = fusion.warnings(1, fusion.estimate(1, t))
+    (text,) = fusion.warnings(t)
     assert text.startswith("the nominal size or the calibration seems wrong: both views make it 0.2")
 
 
 @pytest.mark.parametrize(("wrong", "likely"), [(1.0, True), (1.15, False)])
 def test_a_target_of_another_size_is_an_unlikely_candidate(wrong, likely):
     fusion, _, t = followed(Finder(gate=9.0), wrong=wrong, frames=UNFOUND + 30)
-    for number in (1, 2):  # also while another target is followed
-        fusion.follow(number)
-        (found,) = fusion.candidates([track(1, box_at(*X, wrong=wrong))], t)
+    for target in (fusion.fusion.targets[1], None):  # also while it is not followed
+        fusion.search.follow(target)
+        (found,) = fusion.candidates(t)
         assert found.likely is likely
 
 
@@ -438,14 +462,14 @@ def test_a_target_that_the_zoom_image_cannot_show_causes_no_warning():
     """It is outside the zoom image, or hidden in the fixed image too."""
     outside = (BASELINE + 2.0, 0.0, 10.0)  # 600 px beside the middle
     fusion, _, t = followed(Finder(gate=-1.0), outside, frames=100)
-    assert fusion.warnings(1, fusion.estimate(1, t)) == []
+    assert fusion.warnings(t) == []
     fusion, _, _ = followed(Finder(gate=-1.0), frames=5)
     for i in range(5, 60):
         t = i * FRAME_S
-        show(fusion, t, [track(1, box_at(*X), t, missed=i)])
+        fusion.show(t, [track(1, box_at(*X), t, missed=i)])
         report(fusion, t)
-        fusion.update_zoom(Frame(IMAGE, t), t)
-    assert fusion.warnings(1, fusion.estimate(1, t)) == []
+        fusion.search.update(Frame(IMAGE, t), t)
+    assert fusion.warnings(t) == []
 
 
 # ---------------------------------------------------------------- cameras with different times
@@ -464,17 +488,14 @@ class Ahead(CloseupFinder):
 def apart(by, frames=60, missed=lambda i: 0):
     """Fusion whose zoom frames are newer than the fixed ones by so much [s]; the measurements and the warnings."""
     box = box_at(BASELINE, 0.0, 10.0)
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
-    fusion.follow(1)
-    fusion.search.finder = Ahead()
-    found = []
+    fusion, found = Pair(BOOK, Ahead(), followed=1), []
     for i in range(frames):
         t = 1.0 + i * FRAME_S
-        show(fusion, t, [track(1, box, t, missed=missed(i))])
+        fusion.show(t, [track(1, box, t, missed=missed(i))])
         for when in sorted((t, t + by)):
             report(fusion, when)
-        found.append(fusion.update_zoom(Frame(IMAGE, t + by), t))
-    return fusion, found, fusion.warnings(1, fusion.estimate(1, t))
+        found.append(fusion.search.update(Frame(IMAGE, t + by), t))
+    return fusion, found, fusion.warnings(t)
 
 
 @pytest.mark.parametrize("by", [0.08, 0.13, 0.29, 0.49, -0.13, -0.29, -0.49])
@@ -500,9 +521,7 @@ def test_zoom_frames_without_a_fixed_frame_of_their_time_cause_no_warning():
 
 
 def test_few_zoom_frames_wait_for_a_fixed_camera_that_stops():
-    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
-    fusion.follow(1)
-    fusion.search.finder = Ahead()
+    fusion = Pair(BOOK, Ahead(), followed=1)
     for i in range(100):
-        assert fusion.update_zoom(Frame(IMAGE, i * FRAME_S), 0.0) is None
+        assert fusion.search.update(Frame(IMAGE, i * FRAME_S), 0.0) is None
     assert len(fusion.search.waiting) <= MatchingSettings.latest_s / FRAME_S + 1

@@ -196,4 +196,4 @@ class Flight:
 
 def show(target_filter, view):
     """Update a filter with a measurement in the zoom image."""
-    return target_filter.update_zoom(view.pixel, view.sigma_px, view.pan, view.tilt, view.nominal_px, view.t)
+    return target_filter.add_zoom(view.pixel, view.sigma_px, view.pan, view.tilt, view.nominal_px, view.t)
