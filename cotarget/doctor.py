@@ -148,7 +148,7 @@ def _emergency_stop(config: "RigConfig", rig: Path) -> Finding:
     try:
         refuse_if_stopped(path)
     except EmergencyStopError as error:
-        return Finding(name, False, str(error), f"cotarget clear --rig {rig}")
+        return Finding(name, False, str(error).removeprefix(f"{name}: "), f"cotarget clear --rig {rig}")
     except ConfigError as error:
         return Finding(name, False, str(error), f"{'chmod u+w' if path.parent.is_dir() else 'mkdir -p'} {path.parent}")
     return Finding(name, True, "none")

@@ -28,7 +28,7 @@ from cotarget.config import BoardConfig
 from cotarget.control.controller import reach_of
 from cotarget.errors import CalibrationError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, pose
-from cotarget.rig import Camera, Frame, Image, PanTiltState, Rig, refuse_outside
+from cotarget.rig import Camera, Frame, Image, PanTiltLimits, PanTiltState, Rig, refuse_outside
 from cotarget.targeting import aim
 
 GROWTH = 2.0  # zoom factor of a measurement, or the lens's whole range; less than LEAST_GROWTH measures nothing
@@ -263,7 +263,7 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
         )
         raise CalibrationError(late or unmoved)
     try:
-        command = command_delay(starts, states, rig.head.limits.acceleration)
+        command = command_delay(starts, states, rig.head.limits)
     except CalibrationError as error:
         raise CalibrationError(late or str(error)) from None
     return HeadLatency(zoom, command, len(times), late)
@@ -369,7 +369,7 @@ class HorizontalShift:
 
 
 def command_delay(
-    starts: Sequence[tuple[float, float, float]], states: Sequence[PanTiltState], acceleration: float
+    starts: Sequence[tuple[float, float, float]], states: Sequence[PanTiltState], limits: PanTiltLimits
 ) -> float:
     """Delay from a command to the start of the motion that follows, median over all commands [s].
 
@@ -379,7 +379,7 @@ def command_delay(
     Args:
         starts: for each command its time [s], and the axis's start and goal [rad].
         states: reports of the head.
-        acceleration: acceleration of the axis [rad/s^2].
+        limits: acceleration of the axis, and its slack, within which it may tremble where it stands.
 
     Returns:
         The delay; nan if no report fell into the early part of any turn.
@@ -387,12 +387,13 @@ def command_delay(
     Raises:
         CalibrationError: the head accelerates otherwise, so that its motion does not give the time of its start.
     """
+    acceleration = limits.acceleration
     times = np.array([state.t for state in states])
     pans = np.array([state.pan for state in states])
     found, slopes = [], []
     for (t, before, goal), (until, *_) in zip(starts, [*starts[1:], (np.inf, 0.0, 0.0)], strict=True):
         gone = np.abs(pans - before)
-        early = (times > t) & (times < until) & (gone > 0) & (gone < EARLY * abs(goal - before))
+        early = (times > t) & (times < until) & (gone > limits.slack) & (gone < EARLY * abs(goal - before))
         since = np.sqrt(2 * gone[early] / acceleration)
         if early.any():
             found.append(float(np.median(times[early] - since)) - t)

@@ -96,6 +96,7 @@ class PanTiltLimits:
         speed: highest speed of either axis [rad/s].
         acceleration: acceleration of either axis [rad/s^2].
         step: resolution of either axis [rad]; 0 for a continuous head.
+        slack: angle by which either axis may rest off its goal, as a servo does [rad].
     """
 
     pan: tuple[float, float]
@@ -103,6 +104,12 @@ class PanTiltLimits:
     speed: float
     acceleration: float
     step: float
+    slack: float = 0.0
+
+    @property
+    def tolerance(self) -> float:
+        """Angle by which an axis that has arrived may be off its goal [rad]."""
+        return self.step + self.slack
 
     def capped(self, speed: Speed | None) -> tuple[float, float]:
         """Limit the speeds of pan and tilt to the highest [rad/s]; None stands for the highest.
@@ -127,11 +134,11 @@ def refuse_outside(state: PanTiltState, limits: PanTiltLimits, axes: Sequence[st
     """Refuse a head that stands beyond its limits, where each command would move these axes.
 
     Raises:
-        DeviceError: an axis is beyond its limits by more than a step.
+        DeviceError: an axis is beyond its limits by more than its tolerance.
     """
     for axis in axes:
         angle, (low, high) = getattr(state, axis), getattr(limits, axis)
-        if not low - limits.step <= angle <= high + limits.step:
+        if not low - limits.tolerance <= angle <= high + limits.tolerance:
             raise DeviceError(
                 f"the head stands at {axis} {math.degrees(angle):.1f} degrees, beyond the limits of "
                 f"{math.degrees(low):.1f} to {math.degrees(high):.1f}, and would move inside; if it may, do so first "

@@ -176,7 +176,7 @@ def test_emergency_stop_is_reported(tried, tmp_path, backend):
     assert findings(config)["emergency stop"].ok
     stop.write_text("a bird in the gears\n")
     found = findings(config)["emergency stop"]
-    assert (found.ok, "a bird in the gears" in found.text) == (False, True)
+    assert (found.ok, found.text.startswith("a bird in the gears")) == (False, True)
     assert found.fix == "cotarget clear --rig rig.toml"
     assert findings(parse_config({"backend": backend}))["emergency stop"].ok
 

@@ -257,7 +257,7 @@ def _apart(a: Array, b: Array) -> float:
 
 POLL = 0.02  # time between reads of a state [s]
 HEAD_PATIENCE = 2.0  # timeout beyond what the way takes at the head's speed and acceleration [s]
-POSE_TOLERANCE = np.radians(0.2)  # between commanded and reached angle, beyond one step of the head [rad]
+POSE_TOLERANCE = np.radians(0.2)  # between commanded and reached angle, beyond the head's own tolerance [rad]
 LENS_TIMEOUT = 15.0  # the slowest zoom lenses take some ten seconds from end to end [s]
 
 
@@ -283,7 +283,7 @@ def wait_for_head(rig: Rig, wanted: tuple[float, float], way: float) -> tuple[Pa
     while True:
         state = head.state()
         off = max(abs(state.pan - wanted[0]), abs(state.tilt - wanted[1]))
-        arrived = not state.moving and off <= limits.step + POSE_TOLERANCE
+        arrived = not state.moving and off <= limits.tolerance + POSE_TOLERANCE
         if arrived or clock.now() > deadline:
             return state, arrived
         clock.sleep_until(clock.now() + POLL)

@@ -44,7 +44,7 @@ class HeadSettings:
         nearer: a distant axis approaches its goal if it will be within this part of its present distance.
         slow_lead: part of the lead removed from an axis that is slow while the other turns. With the whole lead the
             head nods with the noise of the speed, without any it lags behind a target that moves slightly aslant.
-        steps_off: a report agrees with the model of the head within this many steps ...
+        steps_off: a report agrees with the model of the head within this many steps and the slack of its axes ...
         time_off_s: ... plus the angle that the axis turns in this time [s].
     """
 
@@ -127,7 +127,7 @@ class HeadModel:
 
     def _is_near(self, state: PanTiltState, motion: Motion) -> bool:
         """Whether a report agrees with a predicted position."""
-        coarse = max(self._settings.steps_off * self._limits.step, MODEL_STEP)
+        coarse = max(self._settings.steps_off * self._limits.step + self._limits.slack, MODEL_STEP)
         reported = state.pan, state.tilt
         return all(
             abs(q - x) <= coarse + self._settings.time_off_s * abs(v)

@@ -125,7 +125,10 @@ class HeadLink(Protocol):
         """
 
     def halt(self, patience: float) -> None:
-        """Stop both axes; return when the unit has acknowledged it, which takes ``patience`` [s] at most."""
+        """Stop both axes; return when the unit has acknowledged it, which takes ``patience`` [s] at most.
+
+        An axis that stands keeps its goal: a servo that took its place for the goal would sag a little at each halt.
+        """
 
     def halt_last(self, patience: float) -> None:
         """Stop both axes as `halt` does, in whatever state unit and line are; no other command follows."""
@@ -741,6 +744,7 @@ def _limits(axes: tuple[AxisFacts, AxisFacts], config: PolledHeadSettings) -> Pa
         speed=min(math.radians(config.speed_deg_s), *(axis.fastest * axis.step for axis in axes)),
         acceleration=min(axis.acceleration * axis.step for axis in axes),
         step=max(axis.step for axis in axes),
+        slack=max(axis.slack * axis.step for axis in axes),
     )
 
 

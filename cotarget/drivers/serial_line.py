@@ -6,6 +6,7 @@
 import contextlib
 import errno
 import re
+import select
 from typing import TYPE_CHECKING
 
 from cotarget.errors import ConfigError, DeviceError
@@ -73,8 +74,14 @@ class SerialLine:
 
     def write(self, data: bytes) -> None:
         """Send bytes without waiting for an answer."""
+        import serial
+
         try:
             self._port.write(data)
+        except serial.SerialTimeoutException as error:
+            # The time of a suspended program counts, though the bytes are sent; a line that takes more is not lost.
+            if not select.select([], [self._port], [], 0)[1]:
+                raise LostError(self.name, error) from error
         except OSError as error:  # pyserial's exceptions are of this kind too
             raise LostError(self.name, error) from error
 

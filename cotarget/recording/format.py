@@ -183,6 +183,7 @@ def spec_table(spec: RigSpec) -> dict[str, Any]:
         "speed": _plain(limits.speed),
         "acceleration": _plain(limits.acceleration),
         "step": _plain(limits.step),
+        **({"slack": _plain(limits.slack)} if limits.slack else {}),
         "real_time": spec.real_time,
         "fixed_rate_hz": _plain(fixed.rate_hz),
         "fixed_latency_s": _plain(fixed.latency_s),
@@ -214,7 +215,12 @@ def parse_spec(table: Mapping[str, Any], described: Callable[[], RigSpec]) -> Ri
     fixed_size, zoom_size, still_size = size("fixed_size"), size("zoom_size"), size("still_size")
     focal_range = pair("focal_range_px")
     limits = PanTiltLimits(
-        pair("pan"), pair("tilt"), float(table["speed"]), float(table["acceleration"]), float(table["step"])
+        pair("pan"),
+        pair("tilt"),
+        float(table["speed"]),
+        float(table["acceleration"]),
+        float(table["step"]),
+        float(table.get("slack", 0.0)),
     )
     if "head_delay_s" in table:
         fixed = CameraSpec(fixed_size, float(table["fixed_rate_hz"]), float(table["fixed_latency_s"]))

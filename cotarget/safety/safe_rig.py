@@ -31,6 +31,8 @@ from cotarget.safety.watchdog import Watchdog, Watcher
 
 log = logging.getLogger(__name__)
 
+# From a command until it is known that the head has arrived, without its way: a few polls over a network at 10 Hz [s].
+ARRIVAL_S = 0.5
 SLOWNESS = 1.5  # factor by which a loaded unit may take longer than its speed and acceleration give
 ANGLE_ROUNDING = 1e-9  # [rad]
 
@@ -96,7 +98,7 @@ class SafeHead:
         peak = min(speed, math.sqrt(way * acceleration))
         from_rest = way / peak + peak / acceleration if way > 0 else 0.0
         # A head that turns the other way must brake first, and then come back.
-        return SLOWNESS * (from_rest + (2 * self._limits.speed / acceleration if state.moving else 0.0))
+        return ARRIVAL_S + SLOWNESS * (from_rest + (2 * self._limits.speed / acceleration if state.moving else 0.0))
 
 
 def _inside(angle: float, bounds: tuple[float, float], limits: PanTiltLimits) -> bool:
@@ -125,6 +127,8 @@ class SafeCamera:
             StaleFrameError: no new frame came, or the newest is too old to act on.
         """
         frame = self._read(newer_than, timeout)
+        if self._clock.now() - frame.t > self._max_age_s:  # it waited while the program was suspended
+            frame = self._read(frame.t, timeout)
         now = self._clock.now()
         age = now - frame.t
         if not age <= self._max_age_s:

@@ -21,7 +21,7 @@ from cotarget.safety.stop_file import StopLook, stop_reason, stopped_by_file
 log = logging.getLogger(__name__)
 
 HALT_TRIES = 2  # when the rig is closed; the driver limits the time of each
-AT_GOAL = math.radians(0.1)  # a head that rests within this and a step of its goal has arrived [rad]
+AT_GOAL = math.radians(0.1)  # a head that rests within this and its tolerance of its goal has arrived [rad]
 OUTSIDE = math.radians(0.5)  # a head farther beyond its soft limits has left them; a servo's overshoot is less [rad]
 
 
@@ -134,13 +134,13 @@ class Watchdog:
             if motion is None or motion.on_its_way or state.moving or state.t < motion.t:
                 return
             off = max(abs(state.pan - motion.goal[0]), abs(state.tilt - motion.goal[1]))
-            if off <= limits.step + AT_GOAL:
+            if off <= limits.tolerance + AT_GOAL:
                 self._motion = None
 
     def _check_inside(self, state: PanTiltState, limits: PanTiltLimits) -> None:
         """Stop a head that was within the soft limits and is not any more; warn of one that is outside of them."""
         off = max(max(low - q, q - high) for q, (low, high) in ((state.pan, limits.pan), (state.tilt, limits.tilt)))
-        was_inside, self._is_inside = self._is_inside, off <= limits.step + OUTSIDE
+        was_inside, self._is_inside = self._is_inside, off <= limits.tolerance + OUTSIDE
         if self._is_inside or was_inside is False:
             return
         place = f"pan {math.degrees(state.pan):.1f}, tilt {math.degrees(state.tilt):.1f} degrees"

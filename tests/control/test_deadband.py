@@ -1,7 +1,7 @@
 """The dead zone on the simulated unit's own axes: how often it is commanded, and how far off the target stands."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -179,6 +179,14 @@ def test_a_target_that_stands_is_centred_once_and_left_alone():
     assert decide(head_controller, 1.12, 0.05) is None
     # Out of the zone it is gone after at once.
     assert decide(head_controller, 1.2, 0.05 + 2 * ZONE).pan == 0.05 + 2 * ZONE
+
+
+def test_a_servo_that_rests_off_its_goal_is_left_alone_too():
+    head_controller = standing(replace(LIMITS, slack=4 * STEP))
+    decide(head_controller, 0.0, 0.05)
+    for i in range(25, 100):
+        head_controller.head.correct(PanTiltState(0.05 + (4 - i % 2) * STEP, 0.0, False, i * FRAME))  # it trembles
+        assert decide(head_controller, i * FRAME, 0.05) is None
 
 
 def test_a_moving_target_is_followed_at_its_own_speed():

@@ -272,6 +272,7 @@ def test_a_servo_arrives_within_its_slack_and_never_loses_its_position(tmp_path,
         head.move(goal, 0.0, wait=True)
         assert not head.state().moving
         assert head.state().pan == pytest.approx(goal + 2.5 * STEP, abs=0.6 * STEP)
+    assert head.limits.slack == pytest.approx(3 * STEP)
     link.stuck = True  # something is in its way
     said = fails(lambda: head.move(500 * STEP, 0.0, wait=True))
     assert "did not arrive in time" in said

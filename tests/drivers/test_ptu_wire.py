@@ -11,12 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import serial
 
 from cotarget.config import SafetyConfig
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.ptu_d46 import D46Head
-from cotarget.drivers.serial_line import InUseError
+from cotarget.drivers.serial_line import InUseError, LostError, SerialLine, open_port
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.errors import DeviceError
 from tests.support.emulated_camera import DEADLINE_S
@@ -171,3 +172,26 @@ def test_a_stop_or_signal_ends_a_reset(stock, state_home, how, status):
 def test_two_programs_on_one_port(stock):
     with opened(stock), pytest.raises(InUseError):
         D46Head(stock.config, MonotonicClock())
+
+
+@pytest.mark.parametrize("stuck", [False, True])
+def test_a_write_that_was_suspended_does_not_lose_the_line_but_one_that_is_stuck_does(stuck):
+    """Pyserial's time for a write goes on while the program is suspended, and runs out after the bytes are sent."""
+    leader, follower = os.openpty()
+    port = open_port(os.ttyname(follower), 9600)
+    line, write = SerialLine(port, "LINE", 9600, MonotonicClock()), port.write
+
+    def late(data):
+        write(data)
+        raise serial.SerialTimeoutException("Write timeout")
+
+    if stuck:
+        with pytest.raises(LostError):
+            line.write(10_000_000 * b"x")
+    else:
+        port.write = late
+        line.write(b"PP ")
+        assert os.read(leader, 10) == b"PP "
+    line.close()
+    os.close(leader)
+    os.close(follower)

@@ -450,7 +450,7 @@ def test_v010_recording_of_every_call_is_replayed():
     assert (spec.fixed.size, spec.zoom.size, spec.zoom.still_size) == ((4, 3), (4, 3), (8, 6))
     assert (spec.zoom.focal_range, spec.real_time) == ((100.0, 1200.0), True)
     assert (spec.fixed.rate_hz, spec.zoom.rate_hz, spec.head.delay_s) == (25.0, 25.0, 0.04)  # of the configuration
-    assert dataclasses.astuple(spec.head.limits) == ((-2.5, 2.5), (-0.75, 0.5), math.inf, 4.0, 0.0)
+    assert spec.head.limits == PanTiltLimits((-2.5, 2.5), (-0.75, 0.5), math.inf, 4.0, 0.0)
     assert (recording.target, recording.ending, recording.truncated) == ("bird", "complete", False)
     assert list(every_call(Replay(recording).rig)) == REPLAYED
 

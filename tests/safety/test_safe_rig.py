@@ -201,6 +201,14 @@ def test_frames_that_are_too_old_or_from_the_future_are_refused(camera, t, newer
     assert f"{camera} camera" in str(caught.value)
 
 
+def test_a_frame_that_waited_while_the_program_was_suspended_is_skipped():
+    rig, asked = Devices(), []
+    times = iter([3.0, 4.9])
+    rig.fixed.read = lambda *a: asked.append(a) or Frame(np.zeros((2, 2, 3), np.uint8), next(times))
+    assert guarded(rig, SafetyConfig()).fixed.read(2.9, 0.7).t == 4.9
+    assert asked == [(2.9, 0.7), (3.0, 0.7)]
+
+
 def test_a_still_may_be_old_when_it_arrives_but_not_older_than_its_request():
     rig, now = Devices(), [5.0]
     rig.clock.now = lambda: now[0]

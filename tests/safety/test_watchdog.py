@@ -5,6 +5,7 @@ import math
 import os
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -137,6 +138,16 @@ def test_a_head_that_rests_off_its_goal_is_watched(rig, safe, goal):
     safe.head.state()
     safe.clock.sleep_until(10.0)
     assert rig.head.halts == [pytest.approx(WATCHDOG_S, abs=EXACT)]
+
+
+def test_a_servo_that_rests_within_its_slack_has_arrived(rig):
+    rig.head.limits = replace(rig.head.limits, slack=math.radians(0.3))
+    rig.head.state = lambda: PanTiltState(math.radians(0.35), 0.0, moving=False, t=rig.clock.now())
+    with guarded(rig, SafetyConfig()) as safe:
+        safe.head.move(0.0, 0.0)
+        safe.head.state()
+        safe.clock.sleep_until(10.0)
+        assert not rig.head.halts
 
 
 def test_a_state_from_before_the_command_does_not_end_its_watch(rig, safe):
@@ -316,9 +327,12 @@ TICK_S = 0.001  # between looks at a head that never arrives
     ((0.2, -1.0), None, False, 1.0 / 4 + 0.1),  # the longer way counts
     ((0.1, 0.0), None, False, 2 * 0.05),  # 0.05 s to half way, and as long to brake: 40 rad/s^2 0.05^2 = 0.1 rad
     ((1.0, 0.5), (4.0, 1.0), False, 1.0 / 1 + 1.0 / 40),  # the slower axis counts
+    ((0.0, 0.0), None, False, 0.0),  # it is there already
     ((1.0, 0.0), None, True, 1.0 / 4 + 0.1 + 2 * 0.1),  # it may move the other way: it brakes and speeds up first
 ])  # fmt: skip
-def test_a_device_may_wait_one_and_a_half_times_the_duration_of_the_motion(goal, speed, moving, way_s):
+def test_a_device_may_wait_one_and_a_half_times_the_duration_of_the_motion_and_for_a_few_polls(
+    goal, speed, moving, way_s
+):
     """On a clock that the waiting device itself turns."""
     now = [0.0]
     rig = RealDevices(SimpleNamespace(now=lambda: now[0], sleep_until=lambda t: None))
@@ -333,7 +347,7 @@ def test_a_device_may_wait_one_and_a_half_times_the_duration_of_the_motion(goal,
 
         rig.head.hang = wait
         safe.head.move(*goal, speed=speed, wait=True)
-    assert now[0] == pytest.approx(1.5 * way_s + SHORT_S, abs=TICK_S)
+    assert now[0] == pytest.approx(1.5 * way_s + 0.5 + SHORT_S, abs=TICK_S)
 
 
 @pytest.mark.wire
