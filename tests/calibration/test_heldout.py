@@ -124,7 +124,7 @@ def test_undetermined_folds_give_no_held_out_check():
     predicted_px = cross_validate(fitted(start, views), POINTS, None, folds=5).predicted_px
     assert predicted_px < 10.0
     finer = 512  # times the pixels in the same image
-    size = (640 * finer, 480 * finer)
-    start = replace(start, fixed=start.fixed.resized(size), zoom_head=start.head.resized(size))
-    again = cross_validate(fitted(start, [view.scaled(finer) for view in views]), POINTS, None, folds=5)
+    views = [view.scaled(finer) for view in views]
+    start = model_of(calibrated(views, sizes=dict.fromkeys(("fixed", "zoom"), (640 * finer, 480 * finer))))
+    again = cross_validate(fitted(start, views), POINTS, None, folds=5)
     assert again.predicted_px == pytest.approx(finer * predicted_px, rel=SAME_FIT)

@@ -110,7 +110,8 @@ def test_limits_of_use_scale_with_the_image(width, edge_px, undetermined):
     for name, sigma in (("fixed.k1", edge_px / (600 * 0.6**3)), ("fixed.cx", edge_px * times)):
         weak = weak_directions(np.array([[1 / sigma**2]]), [name], 1.0, lenses)
         assert bool(len(weak)) == undetermined
-    assert "distortion" in name_directions(["fixed.k1"], np.array([[1.0]]), lenses)
+    small = np.array([[0.2 * edge_px * times, 0.5]])  # little of the first one's limit, all of the other's
+    assert "principal" not in name_directions(["fixed.cx", "T_zoom0_fixed.tx"], small, lenses)
 
 
 @pytest.mark.parametrize(("angles", "begins", "free"), [

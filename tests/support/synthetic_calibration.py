@@ -51,9 +51,9 @@ def drawn_at_stops(truth, rng, placing, **looks):
     return views + views_at_stops(truth, corners, rng, NOISE_PX, **looks)
 
 
-def calibrated(views, method="joint", folds=0, **options):
+def calibrated(views, method="joint", folds=0, sizes=SIZES, **options):
     """The calibration from views; without a held-out check, to be quick."""
-    return calibrate_views(views, BOARD, SIZES, options=Options(method, folds=folds, **options))
+    return calibrate_views(views, BOARD, sizes, options=Options(method, folds=folds, **options))
 
 
 def fitted(start, views, prior=None):
