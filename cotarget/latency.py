@@ -357,7 +357,7 @@ class HorizontalShift:
         self._corners: Array | None = None
 
     def of(self, image: Image) -> float:
-        """Measure an image's shift [px]; 0 if it or the first one shows too few corners."""
+        """Measure an image's shift [px]; 0 if too few corners of the first one are found in it."""
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if self._first is None:
             self._first, self._corners = grey, cv2.goodFeaturesToTrack(grey, CORNERS, WEAKEST, APART_PX)
