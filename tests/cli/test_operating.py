@@ -12,7 +12,7 @@ import pytest
 from cotarget.backends import OPENERS
 from cotarget.config import RigConfig
 from cotarget.drivers import ptu_d46
-from cotarget.drivers.interlock import PositionLostMarker
+from cotarget.drivers.interlock import PositionLostMarker, rig_lock
 from cotarget.emulators.emulation import copied_tables
 from cotarget.errors import EmergencyStopError
 from cotarget.latency import Delay, HeadLatency
@@ -189,6 +189,14 @@ def test_reset_head_with_consent_resets(folder, capsys, monkeypatch, resets, ans
     assert (status, err, resets) == (0, "", [NO_PORT])
     assert out.splitlines()[-1].startswith("reset: v2.12.1d1")
     assert ("camera and cables clear" in out) == (answer != "--yes")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the devices have to refuse a second program")
+@pytest.mark.parametrize("command", [("point",), ("reset-head", "--yes")])
+def test_a_rig_in_use_is_neither_moved_nor_reset(folder, capsys, resets, command):
+    with rig_lock(file=folder / "hw.toml"):
+        assert "another program has the rig of hw.toml" in refused(capsys, *command, "--rig", "hw.toml")
+    assert resets == []
 
 
 class Gone(io.StringIO):
