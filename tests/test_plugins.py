@@ -11,7 +11,6 @@ from cotarget.backends import check, describe, load_config, open_rig
 from cotarget.cli.main import main
 from cotarget.config import parse_config
 from cotarget.detection import make_detector
-from cotarget.doctor import examine
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.rig import Frame
 
@@ -137,6 +136,7 @@ def boxes(image):
 """
 RIG = """
 backend = "hardware"
+board.square = 0.025
 [hardware.fixed]
 driver = "devices:Camera"
 colour = "green"
@@ -174,11 +174,10 @@ def test_commands_and_doctor_use_own_devices(rig, capsys, monkeypatch):
     monkeypatch.chdir("/")
     assert main(["point", "--rig", str(rig), "--pan-deg", "5"]) == 0
     assert json.loads(capsys.readouterr().out)["pan_deg"] == pytest.approx(5)
-    found = {finding.name: finding for finding in examine(load_config(rig))}
-    assert found["hardware.fixed"].text == "a green wall"
-    assert found["hardware.head"].text == "is not asked: its driver has no probe"
-    assert found["hardware.head"].ok is None  # unknown, and neither well nor missing
-    assert found["targets.wall.detector"].ok
+    assert main(["doctor", "--rig", str(rig)]) == ("MISSING" in (out := capsys.readouterr().out))
+    assert "ok       hardware.fixed: a green wall\n" in out
+    assert "unknown  hardware.head: is not asked: its driver has no probe\n" in out
+    assert "ok       targets.wall.detector: " in out
 
 
 def test_own_detector_beside_rig_toml_is_found(rig, monkeypatch):
