@@ -227,15 +227,15 @@ ASCII = "LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0"
     ("", "--help >&-", 1, "", "cotarget: stdout is closed\n"),
     ("", "aim --help >/dev/full", 1, "", "cotarget aim: No space left on device\n"),
     ("", "dance 2>/dev/full", 2, "", ""),
-    ("", "stop --rig stop.toml >&-", 1, "", "cotarget stop: stdout is closed\n"),
-    ("", "stop --rig stop.toml --reason V\udcf6gel", 0, "stopped: ", ""),  # no UTF-8
-    (ASCII, AIM.replace("good", "fr\xfch"), 1, "", "cotarget aim: fr\xfch.json: no such file\n"),
+    ("", "stop --rig \xfc.toml >&-", 1, "", "cotarget stop: stdout is closed\n"),
+    ("", "stop --rig \xfc.toml --reason V\udcf6gel", 0, "stopped: ", ""),  # no UTF-8
+    (ASCII, f"{AIM} --rig \xfc.toml", 1, "", "cotarget aim: \xfc.toml: sim.seed: '\\xf6' should be a valid integer\n"),
     ("", AIM.replace("good", "fr\udcfch"), 1, "", "cotarget aim: fr\udcfch.json: no such file\n"),
 ])  # fmt: skip
 def test_streams_that_are_closed_full_or_of_another_locale(folder, before, line, status, out, err):
     """One line says so, the exit status is not Python's own, and a stop is written whatever stdout is."""
     true_calibration(RigConfig()).save(folder / "good.json")
-    (folder / "stop.toml").write_text('[safety]\nstop_file = "stop"\n')
+    (folder / "\xfc.toml").write_text('[safety]\nstop_file = "stop"\n[sim]\nseed = "\\u00f6"\n')
     shell = os.fsencode(f"{before} {sys.executable} -m cotarget {line}")
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     done = subprocess.run(["sh", "-c", shell], capture_output=True, check=False, env=environment)
