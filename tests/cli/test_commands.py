@@ -142,7 +142,8 @@ def test_aim_at_a_depth_where_no_target_is_seen_has_to_be_insisted_on(folder, ca
     """A person of 1.75 m has 1 px at 1200.5 m, by a focal length of 686 px."""
     assert aim_json(capsys, "--depth", depth, "--insist")[0]["depth_plausible"] is plausible
     status, out, err = call(capsys, *AIM, "--depth", depth)
-    assert (status, bool(out), "is 1.201 m meant?" in err) == ((0, True, False) if plausible else (1, False, True))
+    said = "--depth: at 1201 m the person is 1 px large in the fixed image; is 1.201 m meant? --insist" in err
+    assert (status, bool(out), said) == ((0, True, False) if plausible else (1, False, True))
 
 
 def test_aim_warns_of_a_size_that_the_lens_cannot_show(folder, capsys):

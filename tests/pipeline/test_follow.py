@@ -69,7 +69,6 @@ def test_states_from_searching_to_lost_and_back():
         assert (step.aim is None) == (step.state is State.SEARCHING)
         assert str(step).startswith(f"{step.t:.2f} s: {step.state}")
         assert str(step).endswith("" if step.aim is None else f": {step.aim}")
-        assert "array" not in str(step)
         if step.state is State.LOST:
             assert step.reason.startswith("out of sight for 0.")
             assert "s; looked for where it should be" in step.reason
