@@ -429,17 +429,14 @@ def _ask(options: argparse.Namespace, question: str) -> None:
     """Ask for consent, unless --yes gives it.
 
     Raises:
-        ConfigError: the answer is not yes.
+        ConfigError: the answer is not yes, or there is none.
     """
-    if not options.yes:
-        print(f"{question} [yes/no]", flush=True)
-        if _answer().strip().lower() != CONSENT:
-            raise ConfigError("not reset; it needs the answer yes, or --yes")
-
-
-def _answer() -> str:
-    """Read a line from stdin; empty where there is none."""
+    if options.yes:
+        return
+    print(f"{question} [yes/no]", flush=True)
     try:
-        return sys.stdin.readline() if sys.stdin is not None else ""
+        answer = sys.stdin.readline() if sys.stdin is not None else ""
     except (OSError, ValueError):  # closed terminal, closed file, or not text
-        return ""
+        answer = ""
+    if answer.strip().lower() != CONSENT:
+        raise ConfigError("not reset; it needs the answer yes, or --yes")

@@ -546,11 +546,8 @@ class PolledHead:
         try:
             self.axes = self._link.axes
             compare(config, self.axes)
-            for key, cap in (
-                ("hardware.head.speed_deg_s", config.speed_deg_s),
-                ("safety.speed_deg_s", safety.speed_deg_s),
-            ):
-                _refuse_too_slow(key, cap, self.axes, config.port)
+            _refuse_too_slow("hardware.head.speed_deg_s", config.speed_deg_s, self.axes, config.port)
+            _refuse_too_slow("safety.speed_deg_s", safety.speed_deg_s, self.axes, config.port)
             self._limits = _limits(self.axes, config)
             self._loop = Loop(self._link, clock, config.command_delay_s)
             self._wait_until_it_stands(clock)
