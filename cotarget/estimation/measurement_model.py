@@ -11,7 +11,18 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
-from cotarget.estimation.motion_model import OF_SIZE, PAN, SEEN, TILT, A, B, G, K, L, MotionSettings
+from cotarget.estimation.motion_model import (
+    LOG_APPARENT,
+    LOG_DEPTH,
+    LOG_SIZE,
+    OF_SIZE,
+    PAN,
+    SEEN,
+    TAN_X,
+    TAN_Y,
+    TILT,
+    MotionSettings,
+)
 from cotarget.geometry import Array
 from cotarget.pantilt import HeadGeometry
 from cotarget.targeting import WantedSize
@@ -21,7 +32,8 @@ from cotarget.targeting import WantedSize
 class SightLine:
     """Linear map from a target's direction to the zoom camera's frame, at one pose of the head.
 
-    A target at (a, b, 1) e^l in the fixed camera's frame is seen along d = view (a, b, 1, e^-l) (Eq. 2).
+    A target at (x, y, 1) Z in the fixed camera's frame, with the tangents x and y, is seen along
+    d = view (x, y, 1, 1 / Z) (Eq. 2).
 
     Attributes:
         view: rotation from the fixed to the zoom camera's frame, and the fixed camera's position in it [m], (3, 4).
@@ -40,11 +52,11 @@ class SightLine:
             x: state, see `cotarget.estimation.motion_model`, (13,).
 
         Returns:
-            Tangents in the zoom camera's frame, head bias included, (2,); their derivatives by (a, b, l, pan, tilt),
+            Tangents in the zoom camera's frame, head bias included, (2,); their derivatives by the components `SEEN`,
             (2, 5); and d, whose third coordinate is the ratio of the depths in the zoom and the fixed camera, (3,).
         """
-        nearness = math.exp(-x[L])
-        p = np.array([x[A], x[B], 1.0, nearness])
+        nearness = math.exp(-x[LOG_DEPTH])
+        p = np.array([x[TAN_X], x[TAN_Y], 1.0, nearness])
         pan, tilt = self.by_pan @ p, self.by_tilt @ p
         d = self.view @ p + pan * x[PAN] + tilt * x[TILT]
         tangent = d[:2] / d[2]
@@ -154,7 +166,7 @@ class Estimate:
     @property
     def depth(self) -> float:
         """Depth along the fixed camera's optical axis [m]."""
-        return math.exp(self.state[L])
+        return math.exp(self.state[LOG_DEPTH])
 
     @property
     def bias(self) -> tuple[float, float]:
@@ -164,12 +176,12 @@ class Estimate:
     @property
     def size(self) -> float:
         """Estimated true size of the target [m]."""
-        return self.target.size * math.exp(self.state[K])
+        return self.target.size * math.exp(self.state[LOG_SIZE])
 
     @property
     def size_deviation(self) -> float:
         """Deviation of the true size from the nominal one, in prior standard deviations."""
-        return float(self.state[K]) / self.motion.size_sigma
+        return float(self.state[LOG_SIZE]) / self.motion.size_sigma
 
     @property
     def bias_deviation(self) -> float:
@@ -179,7 +191,7 @@ class Estimate:
     @property
     def wanted_size(self) -> WantedSize:
         """Wanted size of the target for `aim`, from its present apparent size, foreshortened or not."""
-        apparent = self.target.size * math.exp(self.state[K] + self.state[G])
+        apparent = self.target.size * math.exp(self.state[LOG_SIZE] + self.state[LOG_APPARENT])
         return WantedSize(apparent, self.target.wanted_px, self.target.is_vertical())
 
     def appearance(self, pan: float, tilt: float, nominal_px: float) -> Appearance | None:
@@ -199,8 +211,8 @@ class Estimate:
         lens = self.calibration.zoom_head.lens.at(nominal_px)
         focal = np.array(lens.focal_px)
         J = focal[:, None] * J
-        P = self.state_covariance
-        size = math.exp(self.state[K] + self.state[G] - self.state[L]) * self.target.size / d[2]
+        x, P = self.state, self.state_covariance
+        size = math.exp(x[LOG_SIZE] + x[LOG_APPARENT] - x[LOG_DEPTH]) * self.target.size / d[2]
         return Appearance(
             # Distortion is neglected; near the image's centre, where the target should be, it is small.
             offset_px=focal * tangent + np.array(lens.center_px) - lens.image_center_px,

@@ -1,16 +1,17 @@
 """Model a target's motion: a Singer process in coordinates divided by the target's own depth.
 
-The state is x = (a, b, l, w, c, k, g, pan, tilt), 13 numbers:
+The state x has 13 components, which constants name:
 
-- a = X/Z, b = Y/Z: tangents in the fixed camera's frame; l: logarithm of the depth Z;
-- w, c: velocity and acceleration, each divided by the depth (3 + 3);
-- k: logarithm of the true size over the nominal one, a constant;
-- g: logarithm of the apparent size over the true one, which attitude and limbs change;
-- pan, tilt: the head's pointing bias, the true angle less the reported one [rad].
+- `TAN_X` = X/Z, `TAN_Y` = Y/Z: tangents in the fixed camera's frame; `LOG_DEPTH`: logarithm of the depth Z;
+- `VELOCITY`, `ACCELERATION`: each along x, y, z and divided by the depth (3 + 3);
+- `LOG_SIZE`: logarithm of the true size over the nominal one, a constant;
+- `LOG_APPARENT`: logarithm of the apparent size over the true one, which attitude and limbs change;
+- `PAN`, `TILT`: the head's pointing bias, the true angle less the reported one [rad].
 
-The fixed camera measures a, b and the size l - k - g, all linearly. The depth itself appears nowhere in the motion and
-only scales the noise, so bearings alone can never pretend to have measured it (modified spherical coordinates of
-Stallard, 1987, in tangents). The acceleration decays after Singer (1970): c' = -c / tau + white noise.
+The fixed camera measures both tangents and the size, `LOG_DEPTH` - `LOG_SIZE` - `LOG_APPARENT`, all linearly. The depth
+itself appears nowhere in the motion and only scales the noise, so bearings alone can never pretend to have measured it
+(modified spherical coordinates of Stallard, 1987, in tangents). The acceleration c decays after Singer (1970):
+c' = -c / tau + white noise.
 
 `FilterSettings` holds what is assumed before anything is measured, for each kind of target. The comparison of
 motion models and the choice of the numbers: docs/design-notes.md.
@@ -49,10 +50,10 @@ class MotionSettings:
         manoeuvre_s: time constant of the acceleration [s]. Much less than a frame's time makes the velocity a
             random walk; much more makes the acceleration constant.
         speed: standard deviation of the velocity along each axis [m/s].
-        size_sigma: standard deviation of k, the logarithm of the true size over the nominal one.
-        attitude_mean: mean of g, the logarithm of the apparent size over the true one; negative if foreshortened.
-        attitude_sigma: standard deviation of g.
-        attitude_s: time constant of g [s].
+        size_sigma: standard deviation of the logarithm of the true size over the nominal one.
+        attitude_mean: mean of the logarithm of the apparent size over the true one; negative if foreshortened.
+        attitude_sigma: standard deviation of that logarithm.
+        attitude_s: time constant of that logarithm [s].
         bias_sigma: standard deviation of the head's bias, in pan and tilt each [rad].
         bias_s: time constant of that bias [s].
         nearest: least depth of a target, along the fixed camera's axis [m].
@@ -154,12 +155,12 @@ def filter_settings(target: TargetProfile, calibration: Calibration | None = Non
 
 
 STATES = 13
-A, B, L, WA, WB, WL, CA, CB, CL, K, G, PAN, TILT = range(STATES)
-W, C = slice(WA, CA), slice(CA, K)
-MOVING = slice(A, K)  # position, velocity and acceleration; the other four components drift
-SEEN = [A, B, L, PAN, TILT]  # components that a measurement in the zoom image depends on
-OF_SIZE = np.zeros(STATES)  # derivative of a measured size, l - k - g, by the state
-OF_SIZE[[L, K, G]] = 1.0, -1.0, -1.0
+TAN_X, TAN_Y, LOG_DEPTH, VEL_X, VEL_Y, VEL_Z, ACC_X, ACC_Y, ACC_Z, LOG_SIZE, LOG_APPARENT, PAN, TILT = range(STATES)
+VELOCITY, ACCELERATION = slice(VEL_X, ACC_X), slice(ACC_X, LOG_SIZE)
+MOVING = slice(TAN_X, LOG_SIZE)  # position, velocity and acceleration; the other four components drift
+SEEN = [TAN_X, TAN_Y, LOG_DEPTH, PAN, TILT]  # components that a measurement in the zoom image depends on
+OF_SIZE = np.zeros(STATES)  # derivative of a measured size by the state
+OF_SIZE[[LOG_DEPTH, LOG_SIZE, LOG_APPARENT]] = 1.0, -1.0, -1.0
 # Below this ratio of time step to time constant, Singer's noise is that of white jerk to better than 2 %, while its
 # closed form loses its digits.
 SHORT = 0.03
@@ -197,10 +198,10 @@ def span_of(dt: float, motion: MotionSettings) -> Span:
     fade, attitude, bias = (math.exp(-dt / each) for each in (motion.fading_s, motion.attitude_s, motion.bias_s))
     linear = np.diag([*[1.0] * 5, fade, *[rho] * 3, 1.0, attitude, bias, bias])
     for i in range(3):
-        linear[i, WA + i], linear[i, CA + i], linear[WA + i, CA + i] = dt, reach, gain
-    linear[WL, CL] *= fade
+        linear[i, VEL_X + i], linear[i, ACC_X + i], linear[VEL_X + i, ACC_X + i] = dt, reach, gain
+    linear[VEL_Z, ACC_Z] *= fade
     sigmas = np.zeros(STATES)
-    sigmas[G:] = motion.attitude_sigma, motion.bias_sigma, motion.bias_sigma
+    sigmas[LOG_APPARENT:] = motion.attitude_sigma, motion.bias_sigma, motion.bias_sigma
     drift = np.diag(sigmas**2 * (1 - linear.diagonal() ** 2))
     return Span(linear, np.kron(_singer(dt, tau), np.eye(3)).astype(float), drift, reach)
 
@@ -239,34 +240,34 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale
     if dt <= 0:
         return x, P
     span = span_of(dt, motion)
-    closer = 1 + float(x[WL]) * dt + float(x[CL]) * span.reach  # new depth over old depth
-    ratio = max(closer, min(motion.nearest * math.exp(-x[L]), 1.0))
+    closer = 1 + float(x[VEL_Z]) * dt + float(x[ACC_Z]) * span.reach  # new depth over old depth
+    ratio = max(closer, min(motion.nearest * math.exp(-x[LOG_DEPTH]), 1.0))
     y = span.linear @ x
-    log_depth = float(x[L]) + math.log(ratio)
+    log_depth = float(x[LOG_DEPTH]) + math.log(ratio)
     y[MOVING] /= ratio
-    y[L] = log_depth
-    y[G] += motion.attitude_mean * (1 - span.linear[G, G])
+    y[LOG_DEPTH] = log_depth
+    y[LOG_APPARENT] += motion.attitude_mean * (1 - span.linear[LOG_APPARENT, LOG_APPARENT])
     F = span.linear.copy()
     F[MOVING] /= ratio
-    F[L] = 0.0
-    F[L, L] = 1.0
+    F[LOG_DEPTH] = 0.0
+    F[LOG_DEPTH, LOG_DEPTH] = 1.0
     if closer < ratio:  # nearer than possible, so the target has stopped
-        y[[WL, CL]] = 0.0
+        y[[VEL_Z, ACC_Z]] = 0.0
     else:
         shrink = y[MOVING] / ratio
-        shrink[L] = -1 / ratio
-        F[MOVING, WL] -= shrink * dt
-        F[MOVING, CL] -= shrink * span.reach
+        shrink[LOG_DEPTH] = -1 / ratio
+        F[MOVING, VEL_Z] -= shrink * dt
+        F[MOVING, ACC_Z] -= shrink * span.reach
     P = F @ P @ F.T + span.drift
     # Position noise along the axis scales everything that is divided by the depth.
-    N = np.eye(K)
-    N[:, L] -= y[MOVING]
-    N[L, L] = 1.0
+    N = np.eye(LOG_SIZE)
+    N[:, LOG_DEPTH] -= y[MOVING]
+    N[LOG_DEPTH, LOG_DEPTH] = 1.0
     # The mean of 1 / depth^2 over the depth's distribution: an uncertain depth makes the noise larger.
-    sigma = motion.acceleration * math.exp(min(P[L, L], MOST_UNCERTAINTY) - log_depth)
+    sigma = motion.acceleration * math.exp(min(P[LOG_DEPTH, LOG_DEPTH], MOST_UNCERTAINTY) - log_depth)
     P[MOVING, MOVING] += N @ span.noise @ N.T * (noise_scale * sigma * sigma)
-    if P[L, L] > MOST_DEPTH_VARIANCE:  # correlations stay, so the result is still a covariance
-        scale = math.sqrt(MOST_DEPTH_VARIANCE / P[L, L])
-        P[L] *= scale
-        P[:, L] *= scale
+    if P[LOG_DEPTH, LOG_DEPTH] > MOST_DEPTH_VARIANCE:  # correlations stay, so the result is still a covariance
+        scale = math.sqrt(MOST_DEPTH_VARIANCE / P[LOG_DEPTH, LOG_DEPTH])
+        P[LOG_DEPTH] *= scale
+        P[:, LOG_DEPTH] *= scale
     return y, P

@@ -20,27 +20,27 @@ from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.estimation.measurement_model import Estimate, SightLine, SightLines
 from cotarget.estimation.motion_model import (
+    ACC_Z,
+    ACCELERATION,
     CENTER_GATE,
-    CL,
     GATE,
     HEAD_SIGMA,
+    LOG_APPARENT,
+    LOG_DEPTH,
+    LOG_SIZE,
     OF_SIZE,
     PAN,
     SEEN,
     STATES,
+    TAN_X,
+    TAN_Y,
     TILT,
     USUAL_DEPTH,
-    WA,
-    WB,
-    WL,
-    A,
-    B,
-    C,
+    VEL_X,
+    VEL_Y,
+    VEL_Z,
+    VELOCITY,
     FilterSettings,
-    G,
-    K,
-    L,
-    W,
     filter_settings,
     propagate,
 )
@@ -85,7 +85,7 @@ def sound(node: Node, nearest: float) -> Node | None:
     x, P = node.x.copy(), (node.P + node.P.T) / 2
     if not (np.isfinite(x).all() and np.isfinite(P).all() and (P.diagonal() > 0).all()):
         return None
-    x[L] = max(x[L], math.log(nearest))
+    x[LOG_DEPTH] = max(x[LOG_DEPTH], math.log(nearest))
     return replace(node, x=x, P=P)
 
 
@@ -141,13 +141,14 @@ def begin(observed: FixedObservation, settings: FilterSettings) -> Node:
     motion = settings.motion
     x = np.zeros(STATES)
     x[:2] = observed.tangent
-    x[G] = motion.attitude_mean
-    x[L] = math.log(USUAL_DEPTH) if observed.size is None or observed.size.bound else observed.size.log_depth + x[G]
-    nearness = math.exp(-x[L])
+    x[LOG_APPARENT] = motion.attitude_mean
+    size = observed.size
+    x[LOG_DEPTH] = math.log(USUAL_DEPTH) if size is None or size.bound else size.log_depth + x[LOG_APPARENT]
+    nearness = math.exp(-x[LOG_DEPTH])
     sigma = np.zeros(STATES)
-    sigma[L] = settings.depth_sigma
-    sigma[W], sigma[C] = motion.speed * nearness, motion.acceleration * nearness
-    sigma[[K, G]] = motion.size_sigma, motion.attitude_sigma
+    sigma[LOG_DEPTH] = settings.depth_sigma
+    sigma[VELOCITY], sigma[ACCELERATION] = motion.speed * nearness, motion.acceleration * nearness
+    sigma[[LOG_SIZE, LOG_APPARENT]] = motion.size_sigma, motion.attitude_sigma
     sigma[[PAN, TILT]] = motion.bias_sigma
     P = np.diag(sigma**2)
     P[:2, :2] = observed.R
@@ -198,15 +199,15 @@ def correct_zoom(node: Node, observed: ZoomObservation, settings: FilterSettings
             # Where the fixed image contradicts the state too, the target has moved, and neither size nor head is wrong.
             return replace(node, rejected_zoom=node.rejected_zoom + (node.rejected_fixed == 0))
         gain = PHt @ S_inv
-        before, x = x[L], node.x + gain @ innovation
-        if abs(x[L] - before) < CONVERGED:
+        before, x = x[LOG_DEPTH], node.x + gain @ innovation
+        if abs(x[LOG_DEPTH] - before) < CONVERGED:
             break
     mean_nis = _mean_nis(node, nis, settings)
     return replace(node, x=x, P=node.P - gain @ PHt.T, mean_nis=mean_nis, rejected_zoom=0)
 
 
 def _correct_size(node: Node, size: SizeObservation | None, settings: FilterSettings) -> Node:
-    """Correct a node with an apparent size, which measures l - k - g."""
+    """Correct a node with an apparent size, see `OF_SIZE`."""
     if size is None:
         return node
     P, h = node.P, OF_SIZE
@@ -222,7 +223,7 @@ def _correct_size(node: Node, size: SizeObservation | None, settings: FilterSett
             return replace(node, rejected_size=node.rejected_size + 1)
         # The target has turned or come nearer unexpectedly: inflate depth and attitude.
         P = P.copy()
-        P[[L, G], [L, G]] += settings.inflation**2
+        P[[LOG_DEPTH, LOG_APPARENT], [LOG_DEPTH, LOG_APPARENT]] += settings.inflation**2
         Ph = P @ h
         S = float(h @ Ph) + variance
     x = node.x + Ph * (innovation / S)
@@ -236,9 +237,9 @@ def _with_fading_velocity(node: Node, settings: FilterSettings) -> Node:
         return node
     motion = settings.motion
     rho = math.exp(-(node.t - node.fixed_t) / settings.unsized_s)
-    usual = np.array([motion.speed, motion.acceleration]) * math.exp(-node.x[L])
+    usual = np.array([motion.speed, motion.acceleration]) * math.exp(-node.x[LOG_DEPTH])
     x, P = node.x.copy(), node.P.copy()
-    along = [WL, CL]
+    along = [VEL_Z, ACC_Z]
     x[along] *= rho
     P[along] *= rho
     P[:, along] *= rho
@@ -256,15 +257,16 @@ def _restarted(node: Node, observed: FixedObservation, settings: FilterSettings)
     motion = settings.motion
     x, P = node.x.copy(), node.P.copy()
     x[:2] = observed.tangent
-    x[C] = 0.0  # the velocity stays the best guess: a target that is carried off is soon farther off
-    restarted = [A, B, *range(WA, K)]
+    x[ACCELERATION] = 0.0  # the velocity stays the best guess: a target that is carried off is soon farther off
+    moving = range(VEL_X, LOG_SIZE)
+    restarted = [TAN_X, TAN_Y, *moving]
     P[restarted] = 0.0
     P[:, restarted] = 0.0
     P[:2, :2] = observed.R
-    P[L, L] += settings.inflation**2
-    P[range(WA, K), range(WA, K)] = (np.repeat([motion.speed, motion.acceleration], 3) * math.exp(-x[L])) ** 2
+    P[LOG_DEPTH, LOG_DEPTH] += settings.inflation**2
+    P[moving, moving] = (np.repeat([motion.speed, motion.acceleration], 3) * math.exp(-x[LOG_DEPTH])) ** 2
     # It is faster than was expected, except along the axis, where only sizes measure, and badly.
-    P[[WA, WB], [WA, WB]] *= settings.most_noise_scale
+    P[[VEL_X, VEL_Y], [VEL_X, VEL_Y]] *= settings.most_noise_scale
     return replace(node, x=x, P=P, rejected_fixed=0, rejected_zoom=0, mean_nis=1.0)
 
 
@@ -272,7 +274,7 @@ def inflated(P: Array, settings: FilterSettings) -> Array:
     """Inflate size, depth and head bias after zoom images that contradict them."""
     P = P.copy()
     # Size and depth are inflated together, because the fixed image keeps their ratio known.
-    P[np.ix_([L, K], [L, K])] += settings.inflation**2
+    P[np.ix_([LOG_DEPTH, LOG_SIZE], [LOG_DEPTH, LOG_SIZE])] += settings.inflation**2
     P[[PAN, TILT], [PAN, TILT]] += settings.bias_inflation**2
     return P
 
