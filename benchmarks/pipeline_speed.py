@@ -83,7 +83,7 @@ class Pipeline:
         found = self.detector.detect(frame, self.tracks)
         detected = time.perf_counter()
         self.tracks = self.tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
-        self.fusion.update(frame, self.tracks, found.mask, [self.search])
+        self.fusion.add_tracks(frame, self.tracks, found.mask, [self.search])
         targets, T_base_fixed = self.fusion.targets, self.calibration.zoom_head.T_base_fixed
         candidates = candidates_of(targets.values(), frame.t, T_base_fixed, self.size)
         number = self.policy.select(candidates, np.zeros(2), self.limits)

@@ -38,8 +38,8 @@ PARTS: Mapping[str, tuple[tuple[type, str], ...]] = {
         (SmallTargetDetector, "detect"),
     ),
     "track": ((Tracker, "update"),),
-    "position": ((TargetFusion, "update"),),
-    "close_up": ((ZoomSearch, "update"),),
+    "position": ((TargetFusion, "add_tracks"),),
+    "close_up": ((ZoomSearch, "add_frame"),),
 }
 REST = "control"
 # Goals: largest ratio of a turn to the median of MOG2 alone.

@@ -460,6 +460,9 @@ class NetworkConfig:
     std: Annotated[tuple[Positive, Positive, Positive], "[red, green, blue]"] = (255.0, 255.0, 255.0)
 
 
+GOOD_SIZE = (0.8, 1.25)  # of `wanted_px`: range in which a close-up counts as of the wanted size
+
+
 @model
 class TargetProfile:
     """What is known of a target before it is seen.

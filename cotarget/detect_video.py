@@ -114,7 +114,7 @@ def _run(
     times = []
     with_target = 0
     for frame in film:
-        camera.update(frame)
+        camera.track(frame)
         tracks = [track for track in camera.tracks if track.confirmed]
         for track in tracks:
             write_row(_row(film.number, frame.t, track))

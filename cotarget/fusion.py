@@ -201,7 +201,7 @@ class ZoomSearch:
             self.target = target
             self.finder, self.unfound_s = self._make_finder(), 0.0
 
-    def update(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
+    def add_frame(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
         """Register the followed target in the zoom image and update its filter.
 
         A zoom frame newer than the fixed camera's waits until the fixed camera has shown the target at about its time.
@@ -345,7 +345,7 @@ class TargetFusion:
         self._make_filter = partial(TargetFilter, calibration, profile, filter or filter_settings(profile, calibration))
         self.targets: dict[int, Target] = {}
 
-    def update(
+    def add_tracks(
         self,
         frame: Frame,
         tracks: Sequence[Track],

@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from cotarget.config import GOOD_SIZE
 from cotarget.files import read_table
 
 # In frame: least visible part of the silhouette, and least size ratio.
 VISIBLE_IN_FRAME = 0.5
 SIZE_IN_FRAME = 0.5
-# Range of the size ratio of a good close-up.
-GOOD_SIZE = (0.8, 1.25)
 SERVED_S = 1.0  # total time of good close-ups from which a target counts as served [s]
 WHOLLY_VISIBLE = 0.999  # least visible part of a wholly visible target; its area is counted on a grid and rounded
 

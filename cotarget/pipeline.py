@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
-from typing import NamedTuple
 
 import numpy as np
 
@@ -199,7 +198,7 @@ class CameraRun:
         self._detector, self._tracker = detector, tracker
         self.tracks: list[Track] = []
 
-    def update(self, frame: Frame) -> Detections:
+    def track(self, frame: Frame) -> Detections:
         """Detect the targets of a frame, which hold the tracks of the last one, and update the tracks."""
         found = self._detector.detect(frame, self.tracks)
         self.tracks = self._tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
@@ -380,12 +379,7 @@ def _joined(reasons: Iterable[str]) -> str:
     return "; ".join(reason.replace("; ", ", ") for reason in reasons if reason)
 
 
-class _Outcome(NamedTuple):
-    """State after a frame, the reasons for it, and the aim, if any."""
-
-    state: State
-    reasons: tuple[str, ...]
-    aim: Aim | None = None
+Outcome = tuple[State, tuple[str, ...], Aim | None]  # state after a frame, the reasons for it, and the aim, if any
 
 
 class HeadRun:
@@ -440,18 +434,18 @@ class HeadRun:
         self.search.follow(found)
         return found
 
-    def wait(self, found: Detections, tracks: Sequence[Track]) -> _Outcome:
+    def wait(self, found: Detections, tracks: Sequence[Track]) -> Outcome:
         """Zoom out while no target is followed, and explain why none is."""
         self.controller.zoom_out()
         if unmet := self._selector.unmet:
-            return _Outcome(State.SEARCHING, (unmet,))
+            return State.SEARCHING, (unmet,), None
         if tracks:
-            return _Outcome(State.SEARCHING, ("what is detected is not confirmed yet",))
+            return State.SEARCHING, ("what is detected is not confirmed yet",), None
         part = flood(found.mask)
         why = part and f": {part:.0%} of the fixed image changed at once, as when the light does or the camera moves"
-        return _Outcome(State.SEARCHING, (f"nothing is detected{why or ''}",))
+        return State.SEARCHING, (f"nothing is detected{why or ''}",), None
 
-    def follow(self, target: Target, t: float, interval: float) -> _Outcome:
+    def follow(self, target: Target, t: float, interval: float) -> Outcome:
         """Aim at a target and command head and lens.
 
         Args:
@@ -463,17 +457,17 @@ class HeadRun:
         self.count_seen_well(target, interval)
         if t - track.seen_t > self._settings.zoom_out_after_s:
             reason, aim = self._follow_unseen(target.estimate, track.seen_t, interval)
-            return _Outcome(State.LOST, (f"out of sight for {t - track.seen_t:.1f} s", reason), aim)
+            return State.LOST, (f"out of sight for {t - track.seen_t:.1f} s", reason), aim
         try:
-            drive = self.controller.drive(target.estimate, track.seen_t, interval, shape=shape_of(track))
+            aim, zoom_reason = self.controller.drive(target.estimate, track.seen_t, interval, shape=shape_of(track))
         except UnreachableError as error:
             target.unreachable = True
-            return _Outcome(State.UNREACHABLE, (str(error),))
-        reasons = () if drive.zoom_reason == "wanted" else (f"zoom: {drive.zoom_reason}",)
+            return State.UNREACHABLE, (str(error),), None
+        reasons = () if zoom_reason == "wanted" else (f"zoom: {zoom_reason}",)
         if track.missed:
-            return _Outcome(State.COASTING, reasons, drive.aim)
+            return State.COASTING, reasons, aim
         state = State.UNCONFIRMED if self.search.is_unconfirmed else State.FOLLOWING
-        return _Outcome(state, reasons, drive.aim)
+        return state, reasons, aim
 
     def count_seen_well(self, target: Target, seconds: float) -> None:
         """Count a time [s] if the close-up shows a target well, by the states at the newest fixed frame's time."""
@@ -519,32 +513,32 @@ class _Run:
         """Process one frame of the fixed camera, in the order of the paper's Table 1."""
         frames, head = self._frames, self._head
         frame = frames.read_fixed()
-        detections, tracks = self._camera.update(frame), self._camera.tracks
+        detections, tracks = self._camera.track(frame), self._camera.tracks
         favoured = {track.id for track in tracks if self._selector.favours(track)}
-        self._fusion.update(frame, tracks, detections.mask, [head.search], favoured)
+        self._fusion.add_tracks(frame, tracks, detections.mask, [head.search], favoured)
         head.read_states()
         zoom = frames.read_zoom()
-        found = head.search.update(zoom if frames.zoom_is_new else None, frame.t)
+        found = head.search.add_frame(zoom if frames.zoom_is_new else None, frame.t)
         target = head.select(self._fusion.targets.values())
         if target is None:
-            outcome = head.wait(detections, tracks)
+            state, reasons, aim = head.wait(detections, tracks)
         else:
-            outcome = head.follow(target, frame.t, min(frames.interval, LONGEST_INTERVAL_S))
+            state, reasons, aim = head.follow(target, frame.t, min(frames.interval, LONGEST_INTERVAL_S))
         head.read_states()
         estimate = None if target is None else target.estimate(frame.t)
         self._index += 1
         return Step(
             index=self._index - 1,
             t=self._rig.clock.now(),
-            state=outcome.state,
-            reason=_joined([*outcome.reasons, *head.search.warnings(estimate), *frames.faults()]),
+            state=state,
+            reason=_joined([*reasons, *head.search.warnings(estimate), *frames.faults()]),
             fixed=frame,
             zoom=zoom,
             mask=detections.mask,
             detections=tuple(detections.boxes),
             tracks=tuple(tracks),
             target=None if target is None else target.track,
-            aim=outcome.aim,
+            aim=aim,
             commanded=head.controller.commanded,
             head=head.head,
             lens=head.lens,

@@ -427,7 +427,7 @@ def _all_stops(
         rejected += [Rejected(v.name, NO_PLACE) for v in at_stop if v.board not in model.boards]
         if len(here) < FEWEST_STOP_VIEWS or len({view.board for view in here}) < FEWEST_STOP_PLACEMENTS:
             rejected += [
-                Rejected(v.name, f"{len(here)} views at {nominal:.0f} px are too few for a zoom stop") for v in here
+                Rejected(v.name, f"{len(here)} views at {nominal:.0f} px are too few for a zoom sample") for v in here
             ]
             continue
         seen_too = {view.board for view in here}

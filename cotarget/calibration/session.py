@@ -332,7 +332,7 @@ def see_stops(
             continue
         done += 1
         for i, stop in enumerate(stops[1:], start=2):
-            report(f"zoom stop {i} of {len(stops)}, board {done} of {placements}")
+            report(f"zoom sample {i} of {len(stops)}, board {done} of {placements}")
             nominal = recorder.zoom(stop)
             number, guessed = _stop_at(model, nominal)
             if not number:  # a lens with few positions goes to the first one again
@@ -493,7 +493,7 @@ def _stops_without_views(recorder: CaptureRecorder, stops: Sequence[float]) -> l
     half = np.log(stops[1] / stops[0]) / 2
     seen = np.log([view.focal_px for view in recorder.views if view.camera == "zoom" and view.focal_px is not None])
     return [
-        Rejected(f"zoom stop at {stop:.0f} px", f"no part of a board was seen there; {FARTHER}")
+        Rejected(f"zoom sample at {stop:.0f} px", f"no part of a board was seen there; {FARTHER}")
         for stop in stops[1:]
         if not (np.abs(seen - np.log(stop)) < half).any()
     ]

@@ -346,7 +346,7 @@ class LensAtItsEnd:
 
     def see(self, step: "Step") -> None:
         """Count a step with an aim, and the size at which it shows the target."""
-        from cotarget.metrics import GOOD_SIZE
+        from cotarget.config import GOOD_SIZE
 
         if step.aim is None:
             return

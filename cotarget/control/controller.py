@@ -24,30 +24,19 @@ Predict = Callable[[float], Estimate | None]
 
 
 @dataclass(frozen=True)
-class Drive:
-    """Result of driving head and lens for one frame.
-
-    Attributes:
-        aim: aim at where the target will be when a command given now takes effect.
-        zoom_reason: reason for the focal length, see `cotarget.control.zoom.ZoomController.choose`.
-    """
-
-    aim: Aim
-    zoom_reason: str
-
-
-@dataclass(frozen=True)
 class _Course:
-    """Wanted motion of the head.
+    """Wanted motion of the head, predicted over the lead.
 
     Attributes:
         effect_t: time at which a command given now takes effect [s].
+        lead_s: time from the last measurement to ``effect_t`` [s].
         target: estimate of the target at that time.
         first: aim at it.
         then: aim one frame later, at the same focal length.
     """
 
     effect_t: float
+    lead_s: float
     target: Estimate
     first: Aim
     then: Aim
@@ -82,7 +71,7 @@ class Controller:
         self.commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
         self.head_commands, self.lens_commands = 0, 1  # number sent so far
 
-    def drive(self, predict: Predict, seen_t: float, interval: float, *, shape: float = 1.0) -> Drive:
+    def drive(self, predict: Predict, seen_t: float, interval: float, *, shape: float = 1.0) -> tuple[Aim, str]:
         """Send head and lens after a target.
 
         Args:
@@ -90,6 +79,10 @@ class Controller:
             seen_t: time at which it was last seen [s].
             interval: time from one command to the next [s].
             shape: width over height of its box.
+
+        Returns:
+            The aim at where the target will be when a command given now takes effect; and the reason for the focal
+            length, see `cotarget.control.zoom.ZoomController.choose`.
 
         Raises:
             UnreachableError: no pan and tilt within the limits do it, or there is no estimate yet.
@@ -99,7 +92,7 @@ class Controller:
         pan, tilt, focal = self.commanded
         now = self._rig.clock.now()
         exposed = interval + (now + self._rig.spec.zoom.delay_s)
-        (pan_then, _), (tilt_then, _) = self._head_controller.head.predict(exposed)
+        (pan_then, _), (tilt_then, _) = self._head_controller.head.motion_at(exposed)
         then = predict(exposed if self._predict else seen_t)
         focal_px, reason = self._zoom.choose(
             None if then is None else expect(then, pan_then, tilt_then, focal, shape=shape),
@@ -113,7 +106,7 @@ class Controller:
             focal = self._rig.zoom.zoom(nominal)
             self.lens_commands += 1
         self.commanded = (pan, tilt, focal)
-        return Drive(course.first, reason)
+        return course.first, reason
 
     def search(self, predict: Predict, seen_t: float, interval: float) -> Aim | None:
         """Zoom out, and point the head where a target out of sight should be.
@@ -139,7 +132,7 @@ class Controller:
         return course.first
 
     def _course(self, predict: Predict, seen_t: float, interval: float) -> _Course:
-        """Compute the wanted motion of the head. Raises as `drive` does."""
+        """Predict the target over the lead, and compute the wanted motion of the head. Raises as `drive` does."""
         now = self._rig.clock.now()
         effect = now + self._rig.spec.head.delay_s
         times = (effect, effect + interval) if self._predict else (seen_t, seen_t)
@@ -147,10 +140,11 @@ class Controller:
         if at_effect is None or then is None:
             raise UnreachableError("where the target is was not seen yet")
         state = self._rig.head.state()
-        self._head_controller.head.correct(state)  # a halted or slow head is not where it was sent
+        self._head_controller.head.add_report(state)  # a halted or slow head is not where it was sent
         reach = reach_of(self._rig, state)
         first = self._aim(at_effect, reach)
-        return _Course(effect, at_effect, first, self._aim(then, reach, first))
+        lead_s = effect - at_effect.measured_t
+        return _Course(effect, lead_s, at_effect, first, self._aim(then, reach, first))
 
     def _command_head(self, course: _Course, interval: float) -> None:
         """Send the head unless it is held."""
@@ -163,7 +157,7 @@ class Controller:
             (first.pan, first.tilt),
             rates,
             self._rig.zoom.size[0] / self._true(focal),
-            effect - course.target.measured_t,
+            course.lead_s,
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)

@@ -110,9 +110,9 @@ class HeadModel:
 
     def add_command(self, t: float, command: HeadCommand) -> None:
         """Add a command that takes effect at time t [s]."""
-        self._plans.append(_Plan(t, self.predict(t), command))
+        self._plans.append(_Plan(t, self.motion_at(t), command))
 
-    def correct(self, state: PanTiltState) -> None:
+    def add_report(self, state: PanTiltState) -> None:
         """Correct the model with a report of the head."""
         while len(self._plans) > 1 and self._plans[1].t <= state.t:
             self._plans.pop(0)
@@ -120,7 +120,7 @@ class HeadModel:
             self._begin_anew(state)
         self._last = state
 
-    def predict(self, t: float) -> Motion:
+    def motion_at(self, t: float) -> Motion:
         """Predict position and speed of both axes at time t [s]."""
         plan = next((plan for plan in reversed(self._plans) if plan.t <= t), self._plans[0])
         return self._at(plan, t)
@@ -146,7 +146,7 @@ class HeadModel:
         self._plans = [_Plan(state.t, motion, plans[0].command if plans and plans[0].t <= state.t else None)]
         for plan in plans:
             if plan.t > state.t:
-                self._plans.append(replace(plan, motion=self.predict(plan.t)))
+                self._plans.append(replace(plan, motion=self.motion_at(plan.t)))
 
     def _speeds(self, state: PanTiltState) -> Angles:
         """Speeds of both axes from the last two reports [rad/s]; 0 at rest, and after the first report."""
@@ -340,7 +340,7 @@ class HeadController:
 
     def _at(self, t: float) -> Angles:
         """Predicted pan and tilt at time t without a new command [rad]."""
-        (pan, _), (tilt, _) = self.head.predict(t)
+        (pan, _), (tilt, _) = self.head.motion_at(t)
         return pan, tilt
 
     def _follow_reference(

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
+from cotarget.config import GOOD_SIZE
 from cotarget.estimation.measurement_model import Appearance, Estimate
 from cotarget.geometry import Array
-from cotarget.metrics import GOOD_SIZE
 from cotarget.tracking.track import Track
 
 # Probability that the whole target is in the image: below it the lens zooms out, from it on the target is seen well.

@@ -57,14 +57,14 @@ class EnvironmentRig:
     def command(self) -> Command:
         """Compute the command that carries out the pipeline's requests."""
         state, request = self._head.state(), self._head.request
-        self._model.correct(state)
+        self._model.add_report(state)
         if request is None:
             return *clipped(state.pan, state.tilt, self._head.limits), self._zoom.request
         pan, tilt = request.pan, request.tilt
         effect = self.rig.clock.now() + self.rig.spec.head.delay_s
         if request.speed is not None:
             speeds = self._head.limits.capped(request.speed)
-            axes = zip(self._model.predict(effect), (pan, tilt), speeds, strict=True)
+            axes = zip(self._model.motion_at(effect), (pan, tilt), speeds, strict=True)
             pan, tilt = (self._hurried(x, v, goal, speed) for (x, v), goal, speed in axes)
             pan, tilt = clipped(pan, tilt, self._head.limits)
         self._model.add_command(effect, HeadCommand(pan, tilt, None))

@@ -19,29 +19,7 @@ from cotarget.config import TargetProfile
 from cotarget.geometry import Array
 from cotarget.rig import Detection
 
-
-@dataclass(frozen=True)
-class AxisCovariance:
-    """Covariance of an image coordinate and its velocity.
-
-    Attributes:
-        position: variance of the coordinate [px^2].
-        cross: covariance of the two [px^2/s].
-        velocity: variance of the velocity [px^2/s^2].
-    """
-
-    position: float
-    cross: float
-    velocity: float
-
-    def predicted(self, dt: float, process_noise: float) -> "AxisCovariance":
-        """Predict the covariance over ``dt`` [s], forward or back, with white acceleration [px^2/s^3]."""
-        span = abs(dt)
-        return AxisCovariance(
-            self.position + dt * (2 * self.cross + dt * self.velocity) + process_noise * span**3 / 3,
-            self.cross + dt * self.velocity + process_noise * dt * span / 2,
-            self.velocity + process_noise * span,
-        )
+Covariance = tuple[float, float, float]  # of a coordinate and its velocity: variance, covariance, velocity's variance
 
 
 class AxisFilter:
@@ -49,30 +27,37 @@ class AxisFilter:
 
     def __init__(self, position: float, variance: float, velocity_variance: float) -> None:
         self.position, self.velocity = position, 0.0
-        self.covariance = AxisCovariance(variance, 0.0, velocity_variance)
+        self.P: Covariance = (variance, 0.0, velocity_variance)
 
     def predict(self, dt: float, process_noise: float) -> None:
         """Predict ``dt`` [s] ahead with white acceleration [px^2/s^3]."""
         self.position += dt * self.velocity
-        self.covariance = self.covariance.predicted(dt, process_noise)
+        self.P = self.predicted_covariance(dt, process_noise)
+
+    def predicted_covariance(self, dt: float, process_noise: float) -> Covariance:
+        """Predict the covariance over ``dt`` [s], forward or back, with white acceleration [px^2/s^3]."""
+        span, (position, cross, velocity) = abs(dt), self.P
+        return (
+            position + dt * (2 * cross + dt * velocity) + process_noise * span**3 / 3,
+            cross + dt * velocity + process_noise * dt * span / 2,
+            velocity + process_noise * span,
+        )
 
     def correct(self, measured: float, variance: float) -> None:
         """Correct with a measurement [px] and its variance [px^2]."""
-        P = self.covariance
-        S = P.position + variance
-        innovation, gain, velocity_gain = measured - self.position, P.position / S, P.cross / S
+        position, cross, velocity = self.P
+        S = position + variance
+        innovation, gain, velocity_gain = measured - self.position, position / S, cross / S
         self.position += gain * innovation
         self.velocity += velocity_gain * innovation
-        self.covariance = AxisCovariance(
-            P.position - gain * P.position, P.cross - gain * P.cross, P.velocity - velocity_gain * P.cross
-        )
+        self.P = position - gain * position, cross - gain * cross, velocity - velocity_gain * cross
 
     def correct_velocity(self, measured: float, variance: float) -> None:
         """Correct the velocity of a new filter with a measured one [px/s] and its variance [px^2/s^2]."""
-        P = self.covariance
-        gain = P.velocity / (P.velocity + variance)
+        position, cross, velocity = self.P
+        gain = velocity / (velocity + variance)
         self.velocity += gain * (measured - self.velocity)
-        self.covariance = AxisCovariance(P.position, P.cross, P.velocity - gain * P.velocity)
+        self.P = position, cross, velocity - gain * velocity
 
 
 # Areas that differ by more than this factor are those of different objects, or of a part and its object: a bird and a
@@ -438,7 +423,7 @@ class LiveTrack:
     def center_variance(self) -> tuple[float, float]:
         """Variances of the centre along u and v, which are uncorrelated [px^2]."""
         u, v = self._axes
-        return u.covariance.position, v.covariance.position
+        return u.P[0], v.P[0]
 
     @property
     def size(self) -> Array:
@@ -506,7 +491,7 @@ class LiveTrack:
     def track(self) -> Track:
         """Give the state as a frozen `Track`."""
         u, v = self._axes
-        P, Q = u.covariance, v.covariance
+        (uu, u_cross, u_rate), (vv, v_cross, v_rate) = u.P, v.P
         return Track(
             id=self.number,
             t=self.t,
@@ -518,10 +503,10 @@ class LiveTrack:
             larger_side_px=self._sizes.larger_side,
             covariance=np.array(
                 [
-                    [P.position, 0.0, P.cross, 0.0],
-                    [0.0, Q.position, 0.0, Q.cross],
-                    [P.cross, 0.0, P.velocity, 0.0],
-                    [0.0, Q.cross, 0.0, Q.velocity],
+                    [uu, 0.0, u_cross, 0.0],
+                    [0.0, vv, 0.0, v_cross],
+                    [u_cross, 0.0, u_rate, 0.0],
+                    [0.0, v_cross, 0.0, v_rate],
                 ]
             ),
             score=self.detection.score,

@@ -79,7 +79,7 @@ class Watch:
 
     def see(self, frame: Frame, shift: Array, outlines: Mapping[str, Silhouette | None]) -> None:
         """Search a frame with a shift (du, dv) [px], and judge the tracks."""
-        self._camera.update(frame)
+        self._camera.track(frame)
         held = [dataclasses.replace(track, center_px=track.center_px - shift) for track in self._camera.tracks]
         if frame.t < BACKGROUND_S:
             return

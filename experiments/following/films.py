@@ -181,7 +181,7 @@ def tracks_of(
     tracks: dict[float, list[Tracked]] = {least: [] for least in scores}
     camera = CameraRun(detector, own)
     for index, frame in enumerate(frames):
-        found = camera.update(frame)
+        found = camera.track(frame)
         for least, tracker in trackers.items():
             tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
             tracks[least] += _confirmed(tracker, index, frame)

@@ -182,7 +182,7 @@ class _Shooter:
         tracks = self._tracker.update(found.boxes, self.frame.t)
         state = self._rig.head.state()
         for fusion, search in self._fusions:
-            fusion.update(self.frame, tracks, found.mask, [search])
+            fusion.add_tracks(self.frame, tracks, found.mask, [search])
             search.states.add(state, self._rig.zoom.state())
         targets, T_base_fixed = self._fusions[0][0].targets.values(), self._calibration.zoom_head.T_base_fixed
         candidates = candidates_of(targets, self._rig.clock.now(), T_base_fixed, self._rig.fixed.size)
@@ -219,7 +219,7 @@ class _Shooter:
 
     def find_in_zoom(self) -> bool:
         """Search the target in the shot's zoom frame, for the next shot; give whether it was found."""
-        return self._fusions[-1][1].update(self._zoom, self.frame.t) is not None
+        return self._fusions[-1][1].add_frame(self._zoom, self.frame.t) is not None
 
     def forget(self) -> None:
         """Drop what the zoom camera has shown."""

@@ -119,7 +119,7 @@ class Course:
     def at(self, t: float) -> tuple[Angles, Angles]:
         """Predict pan and tilt at a time, with their variances."""
         dt = t - self.seen_t
-        spread = [axis.covariance.predicted(dt, self._noise(self.range)).position for axis in self._axes]
+        spread = [axis.predicted_covariance(dt, self._noise(self.range))[0] for axis in self._axes]
         (pan, tilt) = (axis.position + dt * axis.velocity for axis in self._axes)
         return (pan, tilt), (spread[0], spread[1])
 
@@ -240,7 +240,7 @@ class LoneCamera:
         course, rig = self._course, self._rig
         now = rig.clock.now()
         effect = now + self._delay_s
-        self._head_controller.head.correct(rig.head.state())
+        self._head_controller.head.add_report(rig.head.state())
         wanted, _ = course.at(effect)
         true_px = self._zoom.at(self._focal).focal_px[0]
         field = rig.zoom.size[0] / true_px
@@ -249,7 +249,7 @@ class LoneCamera:
             rig.head.move(command.pan, command.tilt, command.speed)
         exposed = effect + interval
         (pan, tilt), (pan_variance, tilt_variance) = course.at(exposed)
-        (head_pan, _), (head_tilt, _) = self._head_controller.head.predict(exposed)
+        (head_pan, _), (head_tilt, _) = self._head_controller.head.motion_at(exposed)
         scale = math.cos(tilt)
         expected = ExpectedTarget(
             np.array([(pan - head_pan) * scale, head_tilt - tilt]),

@@ -88,7 +88,7 @@ def follow(name, seed, settings):
             goals = [q + r * abs(r) / (2 * LIMITS.acceleration) for q, r in zip(after, rates, strict=True)]
             head.move(t, *goals, None)
         else:
-            head_controller.head.correct(PanTiltState(*head.at(t), True, t))
+            head_controller.head.add_report(PanTiltState(*head.at(t), True, t))
             late = effect - estimates[0].measured_t
             command = head_controller.decide(effect, 1 / RATE, wanted, rates, field_angle, late)
             if command is not None:
@@ -153,7 +153,7 @@ ZONE = max(HeadSettings().zone * WIDTH, STEP)
 def standing(limits=LIMITS, pan=0.0):
     """A head that stands, and nobody has commanded."""
     head_controller = HeadController(limits)
-    head_controller.head.correct(PanTiltState(pan, 0.0, False, -FRAME))
+    head_controller.head.add_report(PanTiltState(pan, 0.0, False, -FRAME))
     return head_controller
 
 
@@ -185,7 +185,7 @@ def test_a_servo_that_rests_off_its_goal_is_left_alone_too():
     head_controller = standing(replace(LIMITS, slack=4 * STEP))
     decide(head_controller, 0.0, 0.05)
     for i in range(25, 100):
-        head_controller.head.correct(PanTiltState(0.05 + (4 - i % 2) * STEP, 0.0, False, i * FRAME))  # it trembles
+        head_controller.head.add_report(PanTiltState(0.05 + (4 - i % 2) * STEP, 0.0, False, i * FRAME))  # it trembles
         assert decide(head_controller, i * FRAME, 0.05) is None
 
 
@@ -198,7 +198,7 @@ def test_a_moving_target_is_followed_at_its_own_speed():
         command = decide(head_controller, t, 0.5 + rate * t, rate)
         commands += [] if command is None else [(t, command)]
         if t > 1.0:
-            at = head_controller.head.predict(t)[0][0]
+            at = head_controller.head.motion_at(t)[0][0]
             assert abs(at - 0.5 - rate * t) < 2 * ZONE
     late = [(t, command) for t, command in commands if t > 1.0]
     ahead_s = HeadSettings().ahead_s
@@ -218,7 +218,9 @@ def test_each_axis_has_its_targets_speed():
         wanted = 0.5 + rates[0] * t, 0.1 + rates[1] * t
         head_controller.decide(t, FRAME, wanted, rates, WIDTH)
     for later in (0.25, 0.5, 0.75):
-        assert [speed for _, speed in head_controller.head.predict(t + later * FRAME)] == pytest.approx(rates, abs=0.03)
+        assert [speed for _, speed in head_controller.head.motion_at(t + later * FRAME)] == pytest.approx(
+            rates, abs=0.03
+        )
 
 
 def test_an_axis_that_stands_is_left_alone_while_the_other_turns():
@@ -248,4 +250,4 @@ def test_a_head_that_jumps_is_sent_to_the_middle_of_the_way():
     head_controller = standing(limits)
     command = decide(head_controller, 0.0, 0.5, 0.4)
     assert (command.pan, command.speed) == (0.5 + 0.4 * FRAME / 2, None)
-    assert head_controller.head.predict(0.0)[0] == (command.pan, 0.0)
+    assert head_controller.head.motion_at(0.0)[0] == (command.pan, 0.0)

@@ -34,11 +34,11 @@ class Unit:
 
     def report(self, t):
         pan, tilt = (round(axis.motor(t)[0] / STEP) * STEP for axis in self.axes)
-        self.model.correct(PanTiltState(pan, tilt, t < self.rests, t))
+        self.model.add_report(PanTiltState(pan, tilt, t < self.rests, t))
 
     def off(self, t):
         """How far the model is from where the unit really is at a time [rad]."""
-        found = self.model.predict(t)
+        found = self.model.motion_at(t)
         return max(abs(x - axis.motor(t)[0]) for (x, _), axis in zip(found, self.axes, strict=True))
 
 
@@ -62,7 +62,7 @@ def test_a_head_that_obeys_is_known_between_its_reports_and_ahead_of_them(unit):
 def test_a_command_that_is_still_to_take_effect_is_counted_with(unit):
     unit.move(0.1, 0.5, 0.0)
     unit.report(0.04)
-    assert unit.model.predict(0.05) == ((0.0, 0.0), (0.0, 0.0))
+    assert unit.model.motion_at(0.05) == ((0.0, 0.0), (0.0, 0.0))
     assert unit.off(0.3) < 1e-9
     assert unit.model.commanded_t == 0.1
 
@@ -102,9 +102,9 @@ def test_a_head_that_turns_when_it_is_first_seen_is_caught_up_with(unit):
 
 def test_a_head_that_arrives_early_is_not_sent_again(unit):
     unit.model.add_command(0.1, HeadCommand(0.1, 0.0, None))
-    unit.model.correct(PanTiltState(0.1, 0.0, False, 0.12))
+    unit.model.add_report(PanTiltState(0.1, 0.0, False, 0.12))
     assert unit.model.command == HeadCommand(0.1, 0.0, None)
-    assert unit.model.predict(0.2) == ((0.1, 0.0), (0.0, 0.0))
+    assert unit.model.motion_at(0.2) == ((0.1, 0.0), (0.0, 0.0))
 
 
 @pytest.mark.parametrize("goal", [0.4, -0.4, 0.01, 0.0])

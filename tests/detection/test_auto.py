@@ -42,7 +42,7 @@ def follow(pictures, rate, rng, detector=None):
     for i, picture in enumerate(pictures):
         image = noisy(picture, rng, NOISE)
         camera = camera or CameraRun(detector, Tracker(tracking_settings(TARGET), image.shape[1::-1]))
-        camera.update(Frame(image, i / rate))
+        camera.track(Frame(image, i / rate))
         found.append([track for track in camera.tracks if track.confirmed])
     return found
 
@@ -269,7 +269,7 @@ def test_a_person_is_found_as_soon_where_frames_come_twice():
         for i, picture in enumerate(moved(background, surface, places)):
             image = noisy(picture, rng, NOISE)
             for t in [(i + k / times) / 25 for k in range(times)]:
-                camera.update(Frame(image, t))
+                camera.track(Frame(image, t))
                 found += [t] * any(each.confirmed for each in camera.tracks)
         return found[0]
 

@@ -67,7 +67,7 @@ class Pair:
         self.followed = followed
 
     def show(self, t, tracks, favoured=()):
-        self.fusion.update(Frame(IMAGE, t), tracks, None, [self.search], favoured)
+        self.fusion.add_tracks(Frame(IMAGE, t), tracks, None, [self.search], favoured)
         self.search.follow(self.fusion.targets.get(self.followed))
 
     def estimate(self, number, t):
@@ -321,7 +321,7 @@ def followed(finder, x_fixed=X, wrong=1.0, frames=40, shake=0.0, **how):
         fusion.show(t, [track(1, box_at(*x_fixed, wrong=wrong), t)])
         report(fusion, t - FRAME_S / 2, pan=-shake)
         report(fusion, t)
-        found.append(fusion.search.update(Frame(IMAGE, t), t))
+        found.append(fusion.search.add_frame(Frame(IMAGE, t), t))
     return fusion, found, t
 
 
@@ -358,11 +358,11 @@ def test_the_zoom_image_is_searched_at_the_heads_angles_plus_their_bias():
 def test_the_zoom_image_is_not_searched_without_a_target_and_a_pose():
     fusion = Pair(BOOK, Finder())
     fusion.show(0.0, [track(1, box_at(*X))])
-    assert fusion.search.update(Frame(IMAGE, 0.0), 0.0) is None  # nothing is followed, no pose is known
+    assert fusion.search.add_frame(Frame(IMAGE, 0.0), 0.0) is None  # nothing is followed, no pose is known
     report(fusion, 0.0)
-    assert fusion.search.update(Frame(IMAGE, 0.0), 0.0) is None
+    assert fusion.search.add_frame(Frame(IMAGE, 0.0), 0.0) is None
     fusion.search.follow(fusion.fusion.targets[1])
-    assert fusion.search.update(Frame(IMAGE, 0.0), 0.0) is not None
+    assert fusion.search.add_frame(Frame(IMAGE, 0.0), 0.0) is not None
 
 
 def test_another_target_has_another_finder():
@@ -468,7 +468,7 @@ def test_a_target_that_the_zoom_image_cannot_show_causes_no_warning():
         t = i * FRAME_S
         fusion.show(t, [track(1, box_at(*X), t, missed=i)])
         report(fusion, t)
-        fusion.search.update(Frame(IMAGE, t), t)
+        fusion.search.add_frame(Frame(IMAGE, t), t)
     assert fusion.warnings(t) == []
 
 
@@ -494,7 +494,7 @@ def apart(by, frames=60, missed=lambda i: 0):
         fusion.show(t, [track(1, box, t, missed=missed(i))])
         for when in sorted((t, t + by)):
             report(fusion, when)
-        found.append(fusion.search.update(Frame(IMAGE, t + by), t))
+        found.append(fusion.search.add_frame(Frame(IMAGE, t + by), t))
     return fusion, found, fusion.warnings(t)
 
 
@@ -523,5 +523,5 @@ def test_zoom_frames_without_a_fixed_frame_of_their_time_cause_no_warning():
 def test_few_zoom_frames_wait_for_a_fixed_camera_that_stops():
     fusion = Pair(BOOK, Ahead(), followed=1)
     for i in range(100):
-        assert fusion.search.update(Frame(IMAGE, i * FRAME_S), 0.0) is None
+        assert fusion.search.add_frame(Frame(IMAGE, i * FRAME_S), 0.0) is None
     assert len(fusion.search.waiting) <= MatchingSettings.latest_s / FRAME_S + 1
