@@ -375,12 +375,14 @@ class HardwareConfig:
         head: the pan-tilt head.
         fixed: the fixed camera.
         zoom: the zoom camera on the head.
+        ptz: zoom camera and head in one housing, in place of `head` and `zoom`.
         board: how the calibration board is presented.
     """
 
     head: Table = field(default_factory=dict)
     fixed: Table = field(default_factory=dict)
     zoom: Table = field(default_factory=dict)
+    ptz: Table = field(default_factory=dict)
     board: Table = field(default_factory=dict)
 
 

@@ -187,6 +187,14 @@ class HeadSpec:
 
 
 @dataclass(frozen=True)
+class UnitSpec:
+    """Properties of a zoom camera and a head in one housing, known without opening them."""
+
+    zoom: ZoomSpec
+    head: HeadSpec
+
+
+@dataclass(frozen=True)
 class RigSpec:
     """Properties of a rig, known without opening it.
 
@@ -270,6 +278,15 @@ class PanTilt(Protocol):
 
     def halt(self) -> None:
         """Stop at once; the head must stay stopped even if the program ends next."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """An open zoom camera and head in one housing, with one connection; `close` halts the head and releases both."""
+
+    zoom: ZoomCamera
+    head: PanTilt
+    close: Callable[[], None]
 
 
 class Clock(Protocol):

@@ -20,7 +20,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from helper import GREY
-from cotarget.rig import CameraSpec, Frame, HeadSpec, PanTiltLimits, PanTiltState, ZoomSpec, ZoomState
+from cotarget.errors import ConfigError
+from cotarget.rig import CameraSpec, Frame, HeadSpec, PanTiltLimits, PanTiltState, UnitSpec, ZoomSpec, ZoomState
 
 LIMITS = PanTiltLimits((-1.0, 1.0), (-0.5, 0.5), 2.0, 4.0, 0.0)
 
@@ -101,6 +102,38 @@ class Head:
 
     def close(self):
         pass
+
+
+@dataclass(frozen=True)
+class DomeSettings(ZoomSettings):
+    host: str = "dome"
+    step_deg: float = 0.1
+
+    @property
+    def spec(self):
+        return UnitSpec(ZoomSettings().spec, HeadSpec(LIMITS, 0.02))
+
+
+class Dome:
+    Settings = DomeSettings
+
+    def __init__(self, settings, clock, safety):
+        if settings.step_deg != 0.1:
+            raise ConfigError("hardware.head.step_deg: its steps are 0.1 degrees")
+        self.zoom, self.head = Zoom(settings, clock), Head(settings, clock, safety)
+
+    @staticmethod
+    def probe(settings):
+        return f"a dome at {settings.host}"
+
+    def close(self):
+        pass
+
+
+class Headless(Dome):
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        del self.head
 
 
 class Limitless(Head):
@@ -223,6 +256,44 @@ def test_an_error_of_a_device_is_one_line_that_names_file_and_line(rig, wrong, e
     rig.write_text(RIG.replace(*wrong))
     with pytest.raises(error, match=f"^{said}"), open_rig(rig) as opened:
         opened.fixed.read()
+
+
+DOME = RIG.replace(
+    '[hardware.zoom]\ndriver = "devices:Zoom"\n[hardware.head]\ndriver = "devices:Head"\n',
+    """
+[hardware.ptz]
+driver = "devices:Dome"
+""",
+)
+
+
+def test_zoom_camera_and_head_in_one_housing(rig):
+    rig.write_text(DOME)
+    config = load_config(rig)
+    assert describe(config).head.delay_s == 0.02
+    with open_rig(config) as opened:
+        assert opened.head.move(0.1, 0.2, wait=True) == (0.1, 0.2)
+        assert opened.zoom.capture().image.shape == (48, 64, 3)
+        assert opened.spec.zoom.focal_range == (100.0, 400.0)
+        with pytest.raises(DeviceError, match="the pan-tilt unit at dome; end it first"), open_rig(config):
+            pass
+
+
+@pytest.mark.parametrize(("was", "now", "said"), [
+    ("[hardware.ptz]", "[hardware.head]\n[hardware.ptz]\n", None),
+    ("[hardware.ptz]", '[hardware.head]\nport = "a"\n[hardware.ptz]\n', "hardware.head: .hardware.ptz. is zoom"),
+    ('driver = "devices:Dome"', 'host = "dome"', r"hardware\.ptz\.driver: is missing; give "),
+    ('"devices:Dome"', '"devices:Headless"', r"hardware\.ptz\.driver: Headless has no head; "),
+    ('"devices:Dome"', '"devices:Head"', r"hardware\.ptz\.driver: spec of its Settings is no UnitSpec"),
+    ('"devices:Dome"', '"devices:Dome"\nstep_deg = 1.0', r"hardware\.ptz\.step_deg: its steps are 0\.1 degrees"),
+])  # fmt: skip
+def test_a_housing_that_is_none_is_refused(rig, was, now, said):
+    rig.write_text(DOME.replace(was, now, 1))
+    if said is None:  # a table without keys says nothing
+        open_rig(rig).close()
+        return
+    with pytest.raises(ConfigError, match=said), open_rig(rig):
+        pass
 
 
 KINDS = {"head": "Head", "zoom": "Zoom", "fixed": "Camera"}

@@ -1,6 +1,7 @@
 """Open the real devices as one Rig; every exit halts the head and releases all devices."""
 
 import contextlib
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass, replace
@@ -25,6 +26,8 @@ from cotarget.rig import (
     PanTiltState,
     Rig,
     RigSpec,
+    Unit,
+    UnitSpec,
     ZoomSpec,
     ZoomState,
 )
@@ -94,6 +97,7 @@ ROLES: Mapping[str, Role] = {
             "close": None,
         },
     ),
+    "ptz": Role(UnitSpec, {}, {"close": None}),  # its zoom camera and its head have what those need
 }
 
 
@@ -101,7 +105,7 @@ ROLES: Mapping[str, Role] = {
 class Device:
     """A device of rig.toml: the driver that opens it, and its checked settings."""
 
-    role: str  # "head", "fixed" or "zoom"
+    role: str  # "head", "fixed", "zoom" or "ptz"
     driver: Any  # class that opens the device; docs/drivers.md says what it has
     settings: Any  # an instance of ``driver.Settings``
     own: bool  # whether the driver is a user's own
@@ -156,7 +160,7 @@ class Device:
             raise ConfigError("is not configured")
         if not hasattr(self.driver, "probe"):
             return None
-        lock = rig_lock(*self.addresses) if self.own and self.role == "head" else contextlib.nullcontext()
+        lock = rig_lock(*self.addresses) if self.own and self.role in ("head", "ptz") else contextlib.nullcontext()
         with lock, calling(self.where):
             return str(self.driver.probe(self.settings))
 
@@ -169,37 +173,62 @@ class Device:
         """
         if not self.own:
             return self.driver(self.settings, *arguments)
-        role = ROLES[self.role]
-        with calling(self.where):
-            device = self.driver(self.settings, *arguments)
-            lacks = [name for name in (*role.attributes, *role.methods) if not hasattr(device, name)]
-        if lacks:
-            raise ConfigError(
-                f"{self.where}.{KEY}: {self.driver.__name__} has no {lacks[0]}; docs/drivers.md says what it needs"
-            )
+        try:
+            with calling(self.where):
+                device = self.driver(self.settings, *arguments)
+        except ConfigError as error:  # a driver may stand in another table than its messages say
+            raise ConfigError(re.sub(r"^hardware\.\w+\b", self.where, str(error))) from error
+        return self._reporting(device, self.role)
+
+    def open_unit(self, *arguments: Any) -> Unit:
+        """Open a device that is a zoom camera and a head in one housing. Raises as `open` does."""
         with contextlib.ExitStack() as opened:
-            own = opened.enter_context(contextlib.closing(Reporting(device, self.where, role.methods)))
-            for name, answer in role.attributes.items():
+            unit = opened.enter_context(contextlib.closing(self.open(*arguments)))
+            with calling(self.where):
+                lacks = [name for name in ("zoom", "head") if not hasattr(unit, name)]
+            if lacks:
+                raise self._lacking(lacks[0])
+            zoom, head = self._reporting(unit.zoom, "zoom"), self._reporting(unit.head, "head")
+            opened.pop_all()
+        return Unit(zoom, head, unit.close)
+
+    def _reporting(self, device: Any, role: str) -> Any:
+        """Check that a user's own device has what a role needs; close it if it has not."""
+        attributes, methods = ROLES[role].attributes, ROLES[role].methods
+        with calling(self.where):
+            lacks = [name for name in (*attributes, *methods) if not hasattr(device, name)]
+        if lacks:
+            raise self._lacking(lacks[0])
+        with contextlib.ExitStack() as opened:
+            own = opened.enter_context(contextlib.closing(Reporting(device, self.where, methods)))
+            for name, answer in attributes.items():
                 check_attribute(device, name, self.where, answer)
             opened.pop_all()
         return own
+
+    def _lacking(self, name: str) -> ConfigError:
+        """Make the error for a driver that lacks a part."""
+        return ConfigError(
+            f"{self.where}.{KEY}: {self.driver.__name__} has no {name}; docs/drivers.md says what it needs"
+        )
 
 
 def device_of(role: str, table: Mapping[str, Any]) -> Device:
     """Find the driver that a table of [hardware] names, and check the table; no device is opened.
 
     Args:
-        role: "head", "fixed" or "zoom".
+        role: "head", "fixed", "zoom" or "ptz".
         table: the table.
 
     Raises:
         ConfigError: there is no such driver, or it refuses the table.
     """
     where, known = f"hardware.{role}", DRIVERS[role]
-    name = table.get(KEY, next(iter(known)))
+    name = table.get(KEY, next(iter(known), None))
     own = isinstance(name, str) and is_own(name)
     if not own and name not in known:
-        raise ConfigError(f"{where}.{KEY}: {name!r} is neither {FORM} nor one of: {choices(known)}")
+        also = f"neither {FORM} nor one of: {choices(known)}" if known else f"not {FORM}"
+        raise ConfigError(f"{where}.{KEY}: {name!r} is {also}" if name else f"{where}.{KEY}: is missing; give {FORM}")
     driver = load(name if own else known[name], f"{where}.{KEY}")
     if not is_dataclass(settings := getattr(driver, "Settings", None)) or not hasattr(settings, "spec"):
         raise ConfigError(f"{where}.{KEY}: {name} has no Settings, a dataclass of its keys in rig.toml with a spec")
@@ -211,10 +240,15 @@ def device_of(role: str, table: Mapping[str, Any]) -> Device:
 def devices(hardware: HardwareConfig) -> dict[str, Device]:
     """Find and check the head, the fixed and the zoom camera; no device is opened.
 
+    A device of [hardware.ptz] is the head, and there is no zoom camera besides.
+
     Raises:
         ConfigError: a table is refused.
     """
-    return {role: device_of(role, getattr(hardware, role)) for role in ROLES}
+    check_hardware(hardware)
+    if not hardware.ptz:
+        return {role: device_of(role, getattr(hardware, role)) for role in ("head", "fixed", "zoom")}
+    return {"head": device_of("ptz", hardware.ptz), "fixed": device_of("fixed", hardware.fixed)}
 
 
 def board_settings(hardware: HardwareConfig) -> BoardSettings:
@@ -234,6 +268,10 @@ def check_hardware(hardware: HardwareConfig) -> None:
     """
     for role in ROLES:
         if table := getattr(hardware, role):
+            if hardware.ptz and role in ("head", "zoom"):
+                raise ConfigError(
+                    f"hardware.{role}: [hardware.ptz] is zoom camera and head in one; leave this table out"
+                )
             device_of(role, table)
     board_settings(hardware)
 
@@ -248,7 +286,9 @@ def rig_spec(config: RigConfig) -> RigSpec:
 
 
 def _spec(found: Mapping[str, Device]) -> RigSpec:
-    return RigSpec(**{role: found[role].spec for role in ROLES}, real_time=True)
+    fixed, head = found["fixed"].spec, found["head"].spec
+    zoom, head = (head.zoom, head.head) if "zoom" not in found else (found["zoom"].spec, head)
+    return RigSpec(fixed, zoom, head, real_time=True)
 
 
 def open_hardware(config: RigConfig, file: Path | None = None) -> Rig:
@@ -270,8 +310,12 @@ def open_hardware(config: RigConfig, file: Path | None = None) -> Rig:
         opened.enter_context(rig_lock(*found["head"].addresses, file=file))
         board = opened.enter_context(contextlib.closing(make_board(board_settings(config.hardware))))
         fixed = opened.enter_context(contextlib.closing(found["fixed"].open(clock)))
-        zoom = opened.enter_context(contextlib.closing(found["zoom"].open(clock)))
-        head = opened.enter_context(contextlib.closing(found["head"].open(clock, config.safety)))
+        if "zoom" in found:
+            zoom = opened.enter_context(contextlib.closing(found["zoom"].open(clock)))
+            head = opened.enter_context(contextlib.closing(found["head"].open(clock, config.safety)))
+        else:
+            unit = opened.enter_context(contextlib.closing(found["head"].open_unit(clock, config.safety)))
+            zoom, head = unit.zoom, unit.head
         reported = replace(
             spec,
             fixed=replace(spec.fixed, size=fixed.size),
