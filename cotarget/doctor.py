@@ -240,8 +240,8 @@ def _ask(name: str, ask: Callable[[], str | None], there: str, rig: Path) -> Fin
 def _fix(error: CotargetError, name: str, there: str, rig: Path) -> str:
     """Return the command or advice that helps with a device that does not answer as it should."""
     from cotarget.drivers.axis import LoginError
+    from cotarget.drivers.link_errors import InUseError, NoPermissionError
     from cotarget.drivers.ptu_d46 import UncalibratedError
-    from cotarget.drivers.serial_line import InUseError, NoPermissionError
 
     match error:
         case MissingPackageError():
@@ -253,5 +253,5 @@ def _fix(error: CotargetError, name: str, there: str, rig: Path) -> str:
         case UncalibratedError():
             return f"cotarget reset-head --rig {rig}"
         case LoginError():
-            return f"give the right user in [{name}] in {rig}, and export COTARGET_PASSWORD=..."
+            return f"give the user in [{name}] in {rig}, and export COTARGET_PASSWORD=... or what password_env names"
     return f"look at the device, its cable, and [{name}] in {rig}"

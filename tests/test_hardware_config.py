@@ -39,7 +39,10 @@ def test_refused_value_is_named_by_its_key(key, value):
 def test_unknown_key_or_driver_is_named_with_the_valid_ones():
     said = refusal("hardware.head.buad = 9600")
     assert said.startswith("unknown key 'hardware.head.buad'; valid here: baud, command_delay_s, driver, pan_deg")
-    assert refusal("hardware.camera.url = ''") == "unknown key 'hardware.camera'; valid here: board, fixed, head, ptz, zoom"
+    assert (
+        refusal("hardware.camera.url = ''")
+        == "unknown key 'hardware.camera'; valid here: board, fixed, head, ptz, zoom"
+    )
     assert refusal("hardware.fixed.driver = 'axes'").endswith(": axis")
 
 

@@ -27,8 +27,6 @@ from cotarget.schema import Check, Needed, NotNegative, Positive, Size, model
 if TYPE_CHECKING:
     import httpx
 
-# Environment variable of the password, where rig.toml has none.
-PASSWORD_VARIABLE = "COTARGET_PASSWORD"
 # Version 2 of the interface keeps the parameters under "view" on some devices.
 PARAMETER_PATHS = ("/axis-cgi/param.cgi", "/axis-cgi/view/param.cgi")
 STATUS_PATH = "/axis-cgi/videostatus.cgi"
@@ -63,7 +61,8 @@ class AxisSettings:
         url: address of the server, such as "http://192.168.0.90".
         camera: number of the camera on the server, from 1.
         user: user name; empty where the server asks for none.
-        password: password; empty where the environment variable COTARGET_PASSWORD holds it.
+        password: password; empty where an environment variable holds it.
+        password_env: name of that variable.
         size: image size that is expected [px].
         resolution: the server's name of the resolution, such as "4CIF"; empty for its default.
         rate_hz: frames per second to request.
@@ -75,6 +74,7 @@ class AxisSettings:
     camera: Annotated[int, Gt(0)] = 1
     user: str = ""
     password: str = ""
+    password_env: str = "COTARGET_PASSWORD"
     size: Size = (704, 576)
     resolution: str = "4CIF"
     rate_hz: Positive = 25.0
@@ -108,7 +108,7 @@ class VideoServer:
     def __init__(self, config: AxisSettings) -> None:
         self._config, parts = config, urlsplit(config.url)
         self._user = config.user or unquote(parts.username or "")
-        self._password = config.password or unquote(parts.password or "") or os.environ.get(PASSWORD_VARIABLE, "")
+        self._password = config.password or unquote(parts.password or "") or os.environ.get(config.password_env, "")
         # Address without user and password, which is the server's name in messages.
         self.name = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}".rstrip("/")
         self.silence_s = max(SILENCE_S, SILENCE_PICTURES / config.rate_hz)
@@ -224,11 +224,11 @@ class VideoServer:
         """Make the error for a response that is no stream, with what would be right."""
         status, config, name = response.status_code, self._config, self.name
         if status == 401 and not (self._user and self._password):
-            missing = f"the environment variable {PASSWORD_VARIABLE}"
+            missing = f"the environment variable {config.password_env}"
             missing = missing if self._user else f"hardware.fixed.user and {missing}"
             return LoginError(f"{name} asks for user and password: set {missing}")
         if status in (401, 403):
-            check = f"check hardware.fixed.user and the password, which may be in {PASSWORD_VARIABLE}"
+            check = f"check hardware.fixed.user and the password, which may be in {config.password_env}"
             return LoginError(f"{name} refuses the user '{self._user}' ({status}): {check}")
         if status == 503:
             return BusyError(f"{name} is busy (503), perhaps with too many viewers: close some")

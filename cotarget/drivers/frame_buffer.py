@@ -184,7 +184,7 @@ class FrameBuffer:
             self._counts = replace(counts, frames=counts.frames + 1, skipped=counts.skipped + skipped)
             self._newest = _Newest(data, arrived - self._latency_s if t is None else t, arrived, self._new_at)
             self._new_at = arrived
-            self._frozen, self._refused, self._remark = False, "", ""
+            self._frozen, self._refused, self._remark, self._lost = False, "", "", ""
             self._changed.notify_all()
             return True
 

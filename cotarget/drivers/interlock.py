@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from cotarget.drivers.serial_line import InUseError
+from cotarget.drivers.link_errors import InUseError
 from cotarget.errors import DeviceError
 
 log = logging.getLogger(__name__)
@@ -31,13 +31,6 @@ STATE_HOME, STATE_HOME_DEFAULT = "XDG_STATE_HOME", "~/.local/state"  # XDG base 
 WITHOUT_STOP_FILE = Path("cotarget") / "head"  # below the state folder
 NO_REASON = "the position of a pan-tilt unit may be lost; see that it is free, then run cotarget reset-head"
 LONGEST_NAME, LONGEST_REASON = 100, 500  # port in the file's name, reason in messages [characters]
-
-
-class PositionLostError(DeviceError):
-    """The unit's position may be lost; the head must not move before its reset."""
-
-    def __init__(self, name: str, what: str) -> None:
-        super().__init__(f"the pan-tilt unit at {name} {what}; see that it is free, then run cotarget reset-head")
 
 
 class PositionLostMarker:

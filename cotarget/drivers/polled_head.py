@@ -19,8 +19,8 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import Annotated, NamedTuple, Protocol, TypeVar
 
 from cotarget.config import SafetyConfig
-from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
-from cotarget.drivers.serial_line import LostError, RefusedError, SilentError
+from cotarget.drivers.interlock import PositionLostMarker
+from cotarget.drivers.link_errors import CutError, LostError, PositionLostError, RefusedError, SilentError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from cotarget.plugins import place_of
 from cotarget.rig import Clock, HeadSpec, PanTiltLimits, PanTiltState, Speed
@@ -79,29 +79,24 @@ class Poll(NamedTuple):
     t: float
 
 
-class CutError(DeviceError):
-    """The unit was silent, and the link halted it before it answered again."""
-
-
 class HeadLink(Protocol):
     """The protocol of an opened pan-tilt unit; `PolledHead` makes one call at a time.
 
-    The link repeats what may be repeated, and ends each call in a bounded time. Besides the errors named below every
+    A link is a subclass, for the halts that it need not have. It repeats what may be repeated, and ends each call in a
+    bounded time. Besides the errors named below every
     method but `close` may raise LostError where the port failed, SilentError where the unit does not answer any more,
     PositionLostError where its position may be lost, or another DeviceError where it cannot be used; the head is then
     halted and closed for good.
 
     Attributes:
         name: of the port, for messages.
-        hurry: set by `PolledHead`; returns whether a halt waits, so that the answer in flight gets little time.
+        axes: facts of pan and tilt, as the unit reported them when it was opened.
+        hurry: set by `PolledHead`; returns whether a halt waits, so that a link that waits for an answer may give up.
     """
 
     name: str
-    hurry: Callable[[], bool]
-
-    @property
-    def axes(self) -> tuple[AxisFacts, AxisFacts]:
-        """Facts of pan and tilt, as the unit reported them when it was opened."""
+    axes: tuple[AxisFacts, AxisFacts]
+    hurry: Callable[[], bool] = staticmethod(lambda: False)
 
     def poll(self) -> Sequence[Poll]:
         """Ask for the position of one axis, in turn, or of both.
@@ -131,13 +126,15 @@ class HeadLink(Protocol):
         """
 
     def halt_last(self, patience: float) -> None:
-        """Stop both axes as `halt` does, in whatever state unit and line are; no other command follows."""
+        """Stop both axes in whatever state unit and line are; no other command follows. By default as `halt` does."""
+        self.halt(patience)
 
     def send_halt(self) -> None:
-        """Send the halt and wait for no answer."""
+        """Send the halt and wait for no answer; by default as `halt` does."""
+        self.halt(0.0)
 
     def check(self) -> None:
-        """Raise PositionLostError if the unit has reported by itself that its position may be lost."""
+        """Raise PositionLostError if the unit has reported by itself that its position may be lost; by default not."""
 
     def close(self) -> None:
         """Release the port; never raises."""
@@ -696,7 +693,7 @@ class PolledHead:
 
 def _checked(link: HeadLink) -> HeadLink:
     """Refuse a link that lacks a part of `HeadLink`, and name the part."""
-    needed = ("name", *(name for name in vars(HeadLink) if not name.startswith("_")))
+    needed = ("name", "axes", *(name for name in vars(HeadLink) if not name.startswith("_")))
     if lacks := [name for name in needed if not hasattr(link, name)]:
         if "close" not in lacks:
             link.close()

@@ -13,11 +13,12 @@ from typing import Annotated
 from cotarget.config import SafetyConfig
 from cotarget.drivers import ptu_protocol
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.interlock import PositionLostError, PositionLostMarker, rig_lock
+from cotarget.drivers.interlock import PositionLostMarker, rig_lock
+from cotarget.drivers.link_errors import CutError, PositionLostError, RefusedError, ReplyError, SilentError
 from cotarget.drivers.polled_head import (
     NOTHING_SAID,
     AxisFacts,
-    CutError,
+    HeadLink,
     Poll,
     PolledHead,
     PolledHeadSettings,
@@ -25,7 +26,6 @@ from cotarget.drivers.polled_head import (
     braking_s,
 )
 from cotarget.drivers.ptu_protocol import AXES, DELIMITER, HALT, PATIENCE_S, AxisName, Line, command, open_line
-from cotarget.drivers.serial_line import RefusedError, ReplyError, SilentError
 from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.rig import Clock
 from cotarget.schema import Limits, OneOf, Positive, model
@@ -88,22 +88,17 @@ def connect(line: Line) -> UnitInfo:
     return unit
 
 
-class D46Link:
+class D46Link(HeadLink):
     """The protocol of a PTU-D46 that `connect` has made ready, a `HeadLink`."""
 
     def __init__(self, line: Line) -> None:
         self._line, self.name = line, line.name
         self.unit: UnitInfo = connect(line)
+        self.axes = self.unit.pan, self.unit.tilt
         self._next = 0  # the axis to poll
         self._goals: list[int | None] = [None, None]  # that the unit has [steps]; None after a halt
         self._speeds: list[int | None] = [None, None]  # that the unit has [steps/s]
-        self.hurry: Callable[[], bool] = lambda: False
         line.hurry = lambda: self.hurry()
-
-    @property
-    def axes(self) -> tuple[AxisFacts, AxisFacts]:
-        """Facts of pan and tilt."""
-        return self.unit.pan, self.unit.tilt
 
     def poll(self) -> Sequence[Poll]:
         """Ask for the position of one axis, in turn."""

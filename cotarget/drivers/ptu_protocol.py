@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Literal, TypeVar
 
-from cotarget.drivers.interlock import PositionLostError
-from cotarget.drivers.serial_line import RefusedError, ReplyError, SerialLine, SilentError, open_port
+from cotarget.drivers.link_errors import PositionLostError, RefusedError, ReplyError, SilentError
+from cotarget.drivers.serial_line import SerialLine, open_port
 from cotarget.errors import DeviceError
 from cotarget.rig import Clock
 

@@ -9,6 +9,7 @@ import re
 import select
 from typing import TYPE_CHECKING
 
+from cotarget.drivers.link_errors import InUseError, LostError, NoPermissionError
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.rig import Clock
 
@@ -19,35 +20,6 @@ SLICE_S = 0.01  # timeout of one read; a longer wait checks its deadline with th
 WRITE_S = 0.5  # a line that takes no bytes for this time is dead [s]
 BITS = 10  # per byte on the wire, 8N1
 HEARD = 200  # received bytes kept for error messages
-NO_DATA = "returned no data"  # pyserial's text for a port that has disappeared
-
-
-class InUseError(DeviceError):
-    """Another program uses the device."""
-
-
-class NoPermissionError(DeviceError):
-    """This user has no permission to use the device."""
-
-
-class SilentError(DeviceError):
-    """The unit did not answer in time."""
-
-
-class ReplyError(DeviceError):
-    """What arrived is no answer of the unit to the command."""
-
-
-class RefusedError(DeviceError):
-    """The unit understood a command and refused it."""
-
-
-class LostError(DeviceError):
-    """The port itself failed: unplugged, or closed by the other side."""
-
-    def __init__(self, name: str, error: OSError) -> None:
-        why = "unplugged, or another program reads there too" if NO_DATA in str(error) else error
-        super().__init__(f"the line to the pan-tilt unit at {name} is lost ({why}); plug it in and open it again")
 
 
 class SerialLine:

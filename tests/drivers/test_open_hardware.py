@@ -15,9 +15,9 @@ from cotarget.drivers.axis import AxisSettings
 from cotarget.drivers.board import BoardSettings
 from cotarget.drivers.gphoto_camera import GphotoSettings
 from cotarget.drivers.interlock import rig_lock
+from cotarget.drivers.link_errors import InUseError
 from cotarget.drivers.ptu_d46 import D46Head, D46Settings
 from cotarget.drivers.rig import device_of, open_hardware
-from cotarget.drivers.serial_line import InUseError
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.plugins import load
 from cotarget.rig import PanTiltLimits

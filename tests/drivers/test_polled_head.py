@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 
 from cotarget.config import SafetyConfig
-from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
-from cotarget.drivers.polled_head import AxisFacts, CutError, Poll, PolledHead, PolledHeadSettings
-from cotarget.drivers.serial_line import LostError, RefusedError, SilentError
+from cotarget.drivers.interlock import PositionLostMarker
+from cotarget.drivers.link_errors import CutError, LostError, PositionLostError, RefusedError, SilentError
+from cotarget.drivers.polled_head import AxisFacts, Poll, PolledHead, PolledHeadSettings
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from tests.support.emulated_camera import DEADLINE_S
 from tests.support.plants import fails, wait_for

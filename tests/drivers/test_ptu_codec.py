@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cotarget.drivers import ptu_protocol
-from cotarget.drivers.serial_line import ReplyError
+from cotarget.drivers.link_errors import ReplyError
 
 VERSION = b"* Pan-Tilt Controller v2.12.1d1(C14/E), (C)2003 Directed Perception, Inc., All Rights Reserved\r\n"
 # Lines as manuals and drivers print them, and the number that they tell.

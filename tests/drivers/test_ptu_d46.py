@@ -9,10 +9,9 @@ from dataclasses import replace
 import pytest
 import serial
 
-from cotarget.drivers.interlock import PositionLostError
+from cotarget.drivers.link_errors import InUseError, LostError, NoPermissionError, PositionLostError, SilentError
 from cotarget.drivers.ptu_d46 import D46Head, D46Settings, UncalibratedError
 from cotarget.drivers.ptu_protocol import open_line
-from cotarget.drivers.serial_line import InUseError, LostError, NoPermissionError, SilentError
 from cotarget.errors import ConfigError, DeviceError
 from tests.support.d46_peer import BANNER, CONFIG, VERSION, Bench
 from tests.support.simulated_clock import SimClock

@@ -16,8 +16,9 @@ import serial
 from cotarget.config import SafetyConfig
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import PositionLostMarker
+from cotarget.drivers.link_errors import InUseError, LostError
 from cotarget.drivers.ptu_d46 import D46Head
-from cotarget.drivers.serial_line import InUseError, LostError, SerialLine, open_port
+from cotarget.drivers.serial_line import SerialLine, open_port
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.errors import DeviceError
 from tests.support.emulated_camera import DEADLINE_S
