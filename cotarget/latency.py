@@ -41,8 +41,11 @@ FIRST, LAST = 0.08, 0.5
 # Largest relative difference between the image's growth and the lens's report; beyond it something else made it grow.
 AS_REPORTED = 0.25
 CORNERS, WEAKEST, APART_PX = 200, 0.01, 8
+SLOW_PERIODS = 1.6  # longest usual time between frames, in the camera's stated period; beyond it, its rate is wrong
 LATE_PERIODS = 2.5  # longest time between two frames or two reports of the head, in their usual times; then one is late
-FEWEST_CORNERS = 12  # with fewer corners there is no scale
+FEWEST_CORNERS = 12  # with fewer corners there is no scale and no shift
+REDUCED_PX = 640  # larger width of images whose shift is measured
+LEVELS = 4  # of the pyramid, for shifts of some 30 px at that width
 
 
 def measure_lens(rig: Rig, late_s: float = 0.0) -> float:
@@ -98,6 +101,11 @@ def lateness(frames: Sequence[float], rate_hz: float, states: Sequence[float] = 
     late = []
     for what, times in (("frames of the zoom camera", frames), ("reports of the head", np.unique(states))):
         apart = np.diff(times)
+        if times is frames and len(apart) and (each := float(np.median(apart))) > SLOW_PERIODS / rate_hz:
+            late.append(
+                f"{what} come every {each:.3f} s, and not every {1 / rate_hz:.3f} s as hardware.zoom.rate_hz says"
+            )
+            continue
         usual = 1 / rate_hz if times is frames else max(1 / rate_hz, float(np.median(apart))) if len(apart) else 0.0
         if len(apart) and apart.max() > LATE_PERIODS * usual:
             late.append(f"{what} came {apart.max():.2f} s apart, and not {usual:.2f} s")
@@ -350,7 +358,10 @@ def delay_between(t: Array, values: Array, t_other: Array, other: Array) -> Dela
 
 
 class HorizontalShift:
-    """Horizontal shift of images against the first one: the median of the corners that are tracked from it."""
+    """Horizontal shift of images against the first one: the median of the corners that are tracked from it.
+
+    Large images are reduced to `REDUCED_PX`: it is faster, and fine texture cannot be tracked over tens of pixels.
+    """
 
     def __init__(self) -> None:
         self._first: Image | None = None
@@ -359,12 +370,15 @@ class HorizontalShift:
     def of(self, image: Image) -> float:
         """Measure an image's shift [px]; 0 if too few corners of the first one are found in it."""
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        factor = max(1.0, grey.shape[1] / REDUCED_PX)
+        if factor > 1:
+            grey = cv2.resize(grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
         if self._first is None:
             self._first, self._corners = grey, cv2.goodFeaturesToTrack(grey, CORNERS, WEAKEST, APART_PX)
         if self._corners is None:
             return 0.0
-        moved, seen, _ = cv2.calcOpticalFlowPyrLK(self._first, grey, self._corners, None)
-        ways = (moved - self._corners)[seen.ravel() > 0, 0, 0]
+        moved, seen, _ = cv2.calcOpticalFlowPyrLK(self._first, grey, self._corners, None, maxLevel=LEVELS)
+        ways = factor * (moved - self._corners)[seen.ravel() > 0, 0, 0]
         return float(np.median(ways)) if len(ways) >= FEWEST_CORNERS else 0.0
 
 

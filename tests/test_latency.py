@@ -69,6 +69,16 @@ def test_a_shifted_picture_tells_its_shift_also_behind_what_moves_otherwise():
         assert shift.of(image) == pytest.approx(by, abs=0.1)
 
 
+@pytest.mark.parametrize("grain_px", [1.5, 4.0, 12.0])
+def test_fine_texture_of_a_large_picture_tells_its_shift(grain_px):
+    """1.5 degrees of a view of 30 degrees are 96 px of 1920."""
+    noise = np.random.default_rng(4).normal(0, 1, (1080, 2020)).astype(np.float32)
+    scene = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), grain_px), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    shift = HorizontalShift()
+    for by in (0, 43, 90):
+        assert shift.of(np.repeat(scene[:, 100 - by : 2020 - by, None], 3, axis=2)) == pytest.approx(by, abs=0.5)
+
+
 @pytest.mark.parametrize("side", [0, 30])
 def test_a_picture_without_structure_has_no_shift(side):
     """Nor has one that shows a square alone."""
@@ -160,6 +170,7 @@ class WeakHead(LateCamera):
     (np.arange(20) / 10, np.arange(200) / 100, ""),
     (np.delete(np.arange(20) / 10, [5]), (), ""),  # one was not read in time
     (np.delete(np.arange(20) / 10, [5, 6]), (), "^frames of the zoom camera came 0.30 s apart, and not 0.10 s"),
+    (np.arange(20) / 5, (), "every 0.200 s, and not every 0.100 s as hardware.zoom.rate_hz says"),
     (np.arange(200) / 50, np.repeat(np.arange(8) / 2, 25), ""),  # a head that reports seldom, as over a network
     (np.arange(20) / 10, np.delete(np.arange(200) / 100, np.s_[9:40]), "^reports of the head came 0.32 s apart, "),
 ])  # fmt: skip
