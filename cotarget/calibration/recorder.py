@@ -4,6 +4,7 @@ A rig whose zoom camera streams only a small preview records full stills instead
 """
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -279,7 +280,8 @@ def wait_for_head(rig: Rig, wanted: tuple[float, float], way: float) -> tuple[Pa
     """
     head, clock = rig.head, rig.clock
     limits = head.limits
-    deadline = clock.now() + way / limits.speed + limits.speed / limits.acceleration + HEAD_PATIENCE
+    braking_s = 0.0 if math.isinf(limits.acceleration) else limits.speed / limits.acceleration
+    deadline = clock.now() + way / limits.speed + braking_s + HEAD_PATIENCE
     while True:
         state = head.state()
         off = max(abs(state.pan - wanted[0]), abs(state.tilt - wanted[1]))

@@ -5,6 +5,7 @@ simulation time passes only inside calls, so each call runs the watchdog, and a 
 """
 
 import atexit
+import contextlib
 import dataclasses
 import logging
 import math
@@ -49,9 +50,15 @@ class SafeHead:
         return self._limits
 
     def state(self) -> PanTiltState:
-        """Return the head's state now."""
+        """Return the head's state now.
+
+        Raises:
+            DeviceError: the device failed, or reports no angles.
+        """
         self._watchdog.on_call()
         state = self._head.state()
+        if not (math.isfinite(state.pan) and math.isfinite(state.tilt)):
+            raise DeviceError(f"the head reports that it is at pan {state.pan}, tilt {state.tilt}")
         self._watchdog.saw(state, self._limits)
         return state
 
@@ -127,8 +134,9 @@ class SafeCamera:
             StaleFrameError: no new frame came, or the newest is too old to act on.
         """
         frame = self._read(newer_than, timeout)
-        if self._clock.now() - frame.t > self._max_age_s:  # it waited while the program was suspended
-            frame = self._read(frame.t, timeout)
+        if self._clock.now() - frame.t > self._max_age_s:  # it may have waited while the program was suspended
+            with contextlib.suppress(StaleFrameError):
+                frame = self._read(frame.t, timeout)
         now = self._clock.now()
         age = now - frame.t
         if not age <= self._max_age_s:
@@ -246,10 +254,13 @@ def soft_limits(device: PanTiltLimits, config: SafetyConfig) -> PanTiltLimits:
     Raises:
         ConfigError: no angle is left, or a limit is not finite.
     """
-    if not (device.speed > 0 and device.acceleration > 0 and 0 <= device.step < math.inf):  # nan is none of these
+    # Nan is none of these.
+    if not (
+        device.speed > 0 and device.acceleration > 0 and 0 <= device.step < math.inf and 0 <= device.slack < math.inf
+    ):
         raise ConfigError(
-            f"the head reports a speed of {device.speed}, an acceleration of {device.acceleration} and a step of "
-            f"{device.step}; correct its driver"
+            f"the head reports a speed of {device.speed}, an acceleration of {device.acceleration}, a step of "
+            f"{device.step} and a slack of {device.slack}; correct its driver"
         )
     return dataclasses.replace(
         device,
@@ -338,6 +349,7 @@ def guard(rig: Rig, config: SafetyConfig) -> Rig:
         behind.begin()
     except BaseException:
         behind.leave()
+        behind.undo_signals()
         rig.close()
         raise
     return guarded
@@ -351,13 +363,13 @@ class _Guard:
         self.watchdog = Watchdog(rig.head, rig.clock, config, threaded=rig.spec.real_time)
         self._closed = False
         self._watcher: Watcher | None = None
-        self._undo_signals: Callable[[], None] = lambda: None
+        self.undo_signals: Callable[[], None] = lambda: None
 
     def begin(self) -> None:
         """Watch a rig in real time, and halt the head of any rig at the program's exit."""
         atexit.register(self._close_at_exit)  # for a rig that the program does not close
         if self._rig.spec.real_time:
-            self._undo_signals = guard_head(self.watchdog)
+            self.undo_signals = guard_head(self.watchdog)
             self._watcher = Watcher(self.watchdog)
 
     def stop(self, reason: str) -> None:
@@ -418,6 +430,7 @@ class _Guard:
             except BaseException as error:
                 errors.append(error)
         deferred.restore()
+        self.undo_signals()  # after the deferral, which has put these handlers back
         for failure in errors[1:]:
             log.info("while the rig was closed: %s", failure)
         if deliver and errors and (interrupt is not None or deferred.pending):
@@ -430,9 +443,8 @@ class _Guard:
             raise next((e for e in errors if not isinstance(e, Exception)), errors[0])
 
     def leave(self) -> None:
-        """Remove this layer's threads, signal handlers and exit hook."""
+        """Remove this layer's threads and exit hook."""
         if self._watcher is not None:
             self._watcher.close()
             self.watchdog.close()
-        self._undo_signals()
         atexit.unregister(self._close_at_exit)

@@ -26,11 +26,17 @@ class GuardedHead(Protocol):
 
     in_main_thread: bool  # whether the main thread opened it, or gave its last command
 
+    def refuse(self, reason: str) -> None:
+        """Refuse moves."""
+
     def stop(self, reason: str) -> None:
         """Halt the head, and refuse moves."""
 
+    def halt(self) -> None:
+        """Halt the head; raises as the device does."""
+
     def held(self) -> contextlib.AbstractContextManager[None]:
-        """Halt the head, and let no command begin in the block."""
+        """Let no command begin in the block."""
 
 
 class _Process:
@@ -55,18 +61,26 @@ class _Process:
             self._undo = None
 
     def _end(self, number: int, frame: FrameType | None) -> None:
-        """Stop the heads of other threads, whose blocks the exception in the main thread does not leave; raise it."""
-        for head in self.heads:
-            if not head.in_main_thread:
-                head.stop(f"{signal.Signals(number).name} ends the program")
+        """Stop the heads of other threads, whose blocks the exception in the main thread does not leave; raise it.
+
+        Where the program ends for certain, no thread moves any head any more.
+        """
+        reason = f"{signal.Signals(number).name} ends the program"
+        others = [head for head in self.heads if not head.in_main_thread]
+        for head in others if number == signal.SIGINT else self.heads:
+            head.refuse(reason)  # all first, because a halt may hang
+        for head in others:
+            head.stop(reason)
         (signal.default_int_handler if number == signal.SIGINT else leave)(number, frame)
 
     def _freeze(self, number: int, frame: FrameType | None) -> None:
         with contextlib.ExitStack() as held:
             may_suspend = True
+            for head in self.heads:  # all first, because a halt may hang
+                held.enter_context(head.held())
             for head in self.heads:
                 try:
-                    held.enter_context(head.held())
+                    head.halt()
                 except Exception as error:
                     may_suspend = False
                     log.error("not suspended, because the head could not be halted: %s", error)

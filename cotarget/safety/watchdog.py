@@ -71,6 +71,7 @@ class Watchdog:
         self._look = StopLook(self._stop_file)  # unused without a watching thread: time passes only inside calls then
         self._lock = threading.RLock()  # reentrant: a signal handler may call stop() anywhere
         self._motion: Motion | None = None
+        self._called_t = -math.inf  # when the device's last call began or ended; an older state says nothing new [s]
         self._alive_at = -math.inf
         self._halts = 0
         self._owed: str | None = None  # why a halt failed that must be repeated
@@ -96,7 +97,7 @@ class Watchdog:
                 raise DeviceError("the rig is closed, so the head does not move any more")
             if self._owed is not None:
                 raise DeviceError(f"the head does not move before it could be halted: {self._owed}")
-            self._alive_at = self._clock.now()
+            self._alive_at = self._called_t = self._clock.now()
             self._motion = Motion(goal, self._alive_at, halts, patience_s)
             self.in_main_thread = is_main_thread()
             return self._motion
@@ -109,7 +110,7 @@ class Watchdog:
         """
         with self._lock:
             interrupted = self._halts != motion.halts
-            self._alive_at = self._clock.now()
+            self._alive_at = self._called_t = self._clock.now()
             if self._motion is motion and not interrupted:
                 self._is_inside = arrived or self._is_inside  # a goal lies within the soft limits
                 self._motion = None if arrived else replace(motion, patience_s=0.0, on_its_way=False)
@@ -139,6 +140,8 @@ class Watchdog:
 
     def _check_inside(self, state: PanTiltState, limits: PanTiltLimits) -> None:
         """Stop a head that was within the soft limits and is not any more; warn of one that is outside of them."""
+        if state.t < self._called_t:
+            return
         off = max(max(low - q, q - high) for q, (low, high) in ((state.pan, limits.pan), (state.tilt, limits.tilt)))
         was_inside, self._is_inside = self._is_inside, off <= limits.tolerance + OUTSIDE
         if self._is_inside or was_inside is False:
@@ -147,7 +150,7 @@ class Watchdog:
         if was_inside:
             self.stop(f"the head left its soft limits: it is at {place}")
         else:
-            log.warning("the head stands beyond its soft limits, at %s; the next command leads it inside", place)
+            log.warning("the head stands beyond its soft limits, at %s", place)
 
     def deadline(self) -> float | None:
         """Return when the head is halted without a sign of life, on the rig's clock [s]; None while it rests."""
@@ -203,19 +206,18 @@ class Watchdog:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Halt the head, and let no command of another thread begin in the block.
-
-        Raises:
-            Exception: as the device raised it.
-        """
+        """Let no command of another thread begin in the block."""
         with self._lock:
-            self.halt()
             yield
+
+    def refuse(self, reason: str) -> None:
+        """Refuse moves until `clear`."""
+        with self._lock:
+            self._stopped = reason
 
     def stop(self, reason: str) -> None:
         """Halt the head, and refuse moves until `clear`."""
-        with self._lock:
-            self._stopped = reason  # first, so that no command follows the halt
+        self.refuse(reason)  # first, so that no command follows the halt
         log.warning("emergency stop: %s", reason)
         self._halt()
 

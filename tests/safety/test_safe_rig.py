@@ -133,6 +133,7 @@ def test_every_command_is_done_within_the_limits_or_refused(step):
     ({"speed": math.nan}, "speed of nan"),
     ({"acceleration": math.nan}, "acceleration of nan"),
     ({"step": math.nan}, "step of nan"),
+    *(({"slack": slack}, f"slack of {slack}") for slack in (math.nan, math.inf, -1.0)),
 ])  # fmt: skip
 def test_a_head_without_usable_limits_is_refused(change, key):
     rig = Devices(Head(replace(LIMITS, **change)))
@@ -141,6 +142,14 @@ def test_a_head_without_usable_limits_is_refused(change, key):
     assert rig.closed
     endless = Devices(Head(replace(LIMITS, pan=(-math.inf, math.inf))))
     assert guarded(endless, SafetyConfig(pan_deg=(-90.0, 90.0))).head.limits.pan == (-math.pi / 2, math.pi / 2)
+
+
+@pytest.mark.parametrize("pose", [(math.nan, 0.0), (0.0, math.nan), (0.0, math.inf)])
+def test_a_head_that_reports_no_angle_is_an_error(pose):
+    rig = Devices()
+    rig.head.pose = pose
+    with pytest.raises(DeviceError, match="reports that it is at pan"):
+        guarded(rig, SafetyConfig()).head.state()
 
 
 @pytest.mark.parametrize("focal_px", [math.nan, math.inf])

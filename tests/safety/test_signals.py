@@ -6,9 +6,9 @@ import threading
 import pytest
 
 from cotarget.config import SafetyConfig
-from cotarget.safety.signals import DeferredSignals, end_politely
+from cotarget.safety.signals import DeferredSignals, end_politely, guard_head
 from tests.support.rigs import guarded
-from tests.support.safety_rigs import SimulatedDevices
+from tests.support.safety_rigs import RealDevices, SimulatedDevices
 
 
 class Ended(BaseException):
@@ -80,3 +80,43 @@ def test_a_signal_that_comes_while_the_rig_closes_is_delivered_when_it_is_closed
         pass
     assert devices.closed
     assert ("the cable is out" in caplog.text) != halts
+
+
+class Head:
+    """A guarded head that logs its calls; a halt shows which heads refuse moves by then."""
+
+    def __init__(self, log, in_main_thread):
+        self.log, self.in_main_thread, self.refuses = log, in_main_thread, False
+
+    def refuse(self, reason):
+        self.refuses = True
+
+    def stop(self, reason):
+        self.log.append([head.refuses for head in HEADS])
+
+
+HEADS = []
+
+
+@pytest.mark.parametrize(("number", "refuse"), [
+    (signal.SIGHUP, [True, True, True]),  # the program ends for certain: the heads of the main thread too
+    (signal.SIGINT, [False, True, True]),
+])  # fmt: skip
+def test_all_heads_refuse_moves_before_one_is_halted(number, refuse):
+    log = []
+    HEADS[:] = [Head(log, True), Head(log, False), Head(log, False)]
+    undo = [guard_head(head) for head in HEADS]
+    try:
+        with pytest.raises((SystemExit, KeyboardInterrupt)):
+            signal.raise_signal(number)
+    finally:
+        for each in undo:
+            each()
+    assert log == [refuse, refuse]
+
+
+def test_a_closed_rig_leaves_no_handler():
+    before = signal.getsignal(signal.SIGINT)
+    with guarded(RealDevices(), SafetyConfig()):
+        assert signal.getsignal(signal.SIGINT) is not before
+    assert signal.getsignal(signal.SIGINT) is before

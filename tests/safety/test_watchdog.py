@@ -186,6 +186,17 @@ def test_a_head_that_leaves_its_soft_limits_is_stopped(rig, outside, by_wait, ca
         safe.head.move(0.0, 0.0)
 
 
+def test_a_state_from_before_the_arrival_shows_no_head_that_left_its_limits(rig):
+    """A head polled over a network starts outside; its last state is from before the move that led it inside."""
+    with guarded(rig, SafetyConfig(pan_deg=(-45.0, 45.0))) as safe:
+        rig.clock.sleep_until(1.0)
+        rig.head.state = lambda: PanTiltState(1.2, 0.0, moving=False, t=0.9)
+        safe.head.state()
+        safe.head.move(0.5, 0.0, wait=True)
+        safe.head.state()
+        assert safe.stopped is None
+
+
 def test_a_head_that_passes_its_goal_is_watched(rig, safe):
     """A moving head is sent to where it is: it is at its goal, and overshoots."""
     safe.head.move(FAR, 0.0)
