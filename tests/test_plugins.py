@@ -275,7 +275,10 @@ def test_zoom_camera_and_head_in_one_housing(rig):
         assert opened.head.move(0.1, 0.2, wait=True) == (0.1, 0.2)
         assert opened.zoom.capture().image.shape == (48, 64, 3)
         assert opened.spec.zoom.focal_range == (100.0, 400.0)
-        with pytest.raises(DeviceError, match="the pan-tilt unit at dome; end it first"), open_rig(config):
+        with (
+            pytest.raises(DeviceError, match="the rig with the pan-tilt unit at dome is open already"),
+            open_rig(config),
+        ):
             pass
 
 

@@ -404,7 +404,7 @@ def reset_head_command(options: argparse.Namespace) -> None:
     _ask(options, "The head will turn through its whole range. Are camera and cables clear of it?")
     look, undo = StopLook(config.safety.stop_file), end_politely()
     try:
-        with rig_lock(*(head.addresses if head.own else ()), file=options.rig):
+        with rig_lock(*head.addresses, file=options.rig):
             done = head.driver.reset(head.settings, MonotonicClock(), config.safety, look.reason)
     finally:
         undo()

@@ -46,7 +46,7 @@ class PositionLostMarker:
 
     def __init__(self, port: str, stop_file: Path | None) -> None:
         self._has_lasting_port = not port.startswith("/dev/pts/")  # another emulator gets a pseudo-terminal's name
-        lasting = [each for each in _identities(port) if not each.startswith("/dev/pts/")]
+        lasting = [each for each in _identities(port) if not each.startswith("/")]  # another unit may get that name
         names = [re.sub(r"[^A-Za-z0-9.]+", "-", each).strip("-")[-LONGEST_NAME:] for each in (port, *lasting)]
         without = _state_home() / WITHOUT_STOP_FILE
         beside = without if stop_file is None else stop_file.absolute()
@@ -175,7 +175,7 @@ def rig_lock(*addresses: str, file: Path | None = None) -> Iterator[None]:
         file: the rig.toml; None for a rig without one.
 
     Raises:
-        InUseError: another program has the lock.
+        InUseError: another program, or this one, has the lock.
     """
     names = {name: f"the rig with the pan-tilt unit at {each}" for each in addresses for name in _identities(each)}
     if file is not None:
@@ -187,5 +187,5 @@ def rig_lock(*addresses: str, file: Path | None = None) -> Iterator[None]:
                 lock.bind(f"\0cotarget rig {hashlib.sha256(name.encode()).hexdigest()}")
             except OSError as error:
                 if error.errno == errno.EADDRINUSE:
-                    raise InUseError(f"another program has {rig}; end it first") from None
+                    raise InUseError(f"{rig} is open already, here or in another program; end that first") from None
         yield

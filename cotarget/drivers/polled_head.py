@@ -133,6 +133,10 @@ class HeadLink(Protocol):
         """Send the halt and wait for no answer; by default as `halt` does."""
         self.halt(0.0)
 
+    def goals(self) -> tuple[int, int] | None:
+        """Positions [steps] that the unit was last sent to, also by another program; None if it cannot tell."""
+        return None
+
     def check(self) -> None:
         """Raise PositionLostError if the unit has reported by itself that its position may be lost; by default not."""
 
@@ -546,6 +550,7 @@ class PolledHead:
             _refuse_too_slow("hardware.head.speed_deg_s", config.speed_deg_s, self.axes, config.port)
             _refuse_too_slow("safety.speed_deg_s", safety.speed_deg_s, self.axes, config.port)
             self._limits = _limits(self.axes, config)
+            self._goals = self._link.goals() if hasattr(self._link, "goals") else None
             self._loop = Loop(self._link, clock, config.command_delay_s)
             self._wait_until_it_stands(clock)
         except BaseException as error:
@@ -597,15 +602,29 @@ class PolledHead:
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
         fastest = self._limits.capped(speed)
         axes = self.axes
-        a, b = (
-            min(max(round(sign * angle / axis.step), axis.lowest), axis.highest)
-            for sign, angle, axis in zip(self._signs, (pan, tilt), axes, strict=True)
+        a, b = self._goals = self._kept(
+            [
+                min(max(round(sign * angle / axis.step), axis.lowest), axis.highest)
+                for sign, angle, axis in zip(self._signs, (pan, tilt), axes, strict=True)
+            ]
         )
         move = Move(number, (a, b), (_steps(fastest[0], axes[0]), _steps(fastest[1], axes[1])), wait)
         self._loop.moves.append(move)
         if wait:
             self._wait_for(move)
         return self._angles(a, b)
+
+    def _kept(self, goals: Sequence[int]) -> tuple[int, int]:
+        """Keep the last goal of an axis that is sent to where it stands, off that goal by its slack at most.
+
+        To be sent to where it sags to, a servo would sag again.
+        """
+        seen, kept = self._loop.snapshot, list(goals)
+        for i, (goal, axis) in enumerate(zip(goals, self.axes, strict=True)):
+            stands_there = not seen.moving and goal == round((seen.pan, seen.tilt)[i])
+            if stands_there and self._goals is not None and abs(self._goals[i] - goal) <= axis.slack:
+                kept[i] = self._goals[i]
+        return kept[0], kept[1]
 
     def halt(self) -> None:
         """Stop both axes before anything else is sent; return when the unit has acknowledged it.
@@ -693,7 +712,8 @@ class PolledHead:
 
 def _checked(link: HeadLink) -> HeadLink:
     """Refuse a link that lacks a part of `HeadLink`, and name the part."""
-    needed = ("name", "axes", *(name for name in vars(HeadLink) if not name.startswith("_")))
+    optional = ("hurry", "goals")
+    needed = ("name", "axes", *(name for name in vars(HeadLink) if not name.startswith("_") and name not in optional))
     if lacks := [name for name in needed if not hasattr(link, name)]:
         if "close" not in lacks:
             link.close()

@@ -13,7 +13,7 @@ from typing import Annotated
 from cotarget.config import SafetyConfig
 from cotarget.drivers import ptu_protocol
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.interlock import PositionLostMarker, rig_lock
+from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.link_errors import CutError, PositionLostError, RefusedError, ReplyError, SilentError
 from cotarget.drivers.polled_head import (
     NOTHING_SAID,
@@ -172,7 +172,7 @@ class D46Head(PolledHead):
             DeviceError: there is no pan-tilt unit, or another program uses it.
         """
         port = settings.port
-        with rig_lock(port), contextlib.closing(open_line(port, settings.baud, MonotonicClock())) as line:
+        with contextlib.closing(open_line(port, settings.baud, MonotonicClock())) as line:
             try:
                 line.write(DELIMITER)
                 line.drain(GREETING_QUIET_S, GREETING_MOST_S)
@@ -209,7 +209,7 @@ class D46Head(PolledHead):
             DeviceError: the reset failed.
         """
         port, lost = settings.port, PositionLostMarker(settings.port, safety.stop_file)
-        with rig_lock(port), contextlib.closing(open_line(port, settings.baud, clock)) as line:
+        with contextlib.closing(open_line(port, settings.baud, clock)) as line:
             greet(line)
             _refuse_if_stopped(stopped)
             lost.note(str(PositionLostError(port, "has begun a reset that did not come to its end")))

@@ -1,6 +1,7 @@
 """Open the real devices as one Rig; every exit halts the head and releases all devices."""
 
 import contextlib
+import ipaddress
 import re
 import sys
 from collections.abc import Mapping
@@ -38,6 +39,15 @@ from cotarget.schema import missing_key, validate
 SWITCH_INTERVAL = 5e-4
 KEY = "driver"
 ADDRESS_KEYS = ("port", "host", "url", "address")  # of settings that say where a device is
+IPV6 = 6
+
+
+def _ip(text: str) -> int:
+    """Version of an IP address, 4 or 6; 0 for what is none."""
+    try:
+        return ipaddress.ip_address(text).version
+    except ValueError:
+        return 0
 
 
 def _is_frame(answer: object) -> bool:
@@ -130,12 +140,22 @@ class Device:
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """The addresses in the settings: a serial port, HOST:PORT or a URL, whatever the key."""
-        named = {key: getattr(self.settings, key, "") for key in ADDRESS_KEYS}
-        if named["host"] and named["port"]:
-            named |= {"host": f"{named['host']}:{named['port']}", "port": ""}
-        urls = [value for value in vars(self.settings).values() if isinstance(value, str) and "://" in value]
-        return tuple(dict.fromkeys(str(each) for each in (*named.values(), *urls) if each))
+        """The addresses in the settings: a serial port, HOST, HOST:PORT or a URL.
+
+        They are what the keys `port`, `host`, `url` and `address` hold, and what is an address by its form: an IP
+        address, a path in /dev, or a URL. A number in `port` is the port of that host.
+        """
+        number = getattr(self.settings, "port", "")
+        port = str(number) if str(number).isdigit() and int(number) else ""
+        found = []
+        for key, value in vars(self.settings).items():
+            if not isinstance(value, str) or not value or (key == "port" and value.isdigit()):
+                continue
+            if (ip := _ip(value)) or key in ADDRESS_KEYS or "://" in value or value.startswith("/dev/"):
+                is_host = "://" not in value and "/" not in value and key != "port"
+                host = f"[{value}]" if ip == IPV6 else value
+                found.append(f"{host}:{port}" if is_host and port else host)
+        return tuple(dict.fromkeys(found))
 
     def refuse_missing(self) -> None:
         """Refuse settings that lack what opening the device needs.
@@ -160,7 +180,7 @@ class Device:
             raise ConfigError("is not configured")
         if not hasattr(self.driver, "probe"):
             return None
-        lock = rig_lock(*self.addresses) if self.own and self.role in ("head", "ptz") else contextlib.nullcontext()
+        lock = rig_lock(*self.addresses) if self.role in ("head", "ptz") else contextlib.nullcontext()
         with lock, calling(self.where):
             return str(self.driver.probe(self.settings))
 

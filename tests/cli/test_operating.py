@@ -195,7 +195,7 @@ def test_reset_head_with_consent_resets(folder, capsys, monkeypatch, resets, ans
 @pytest.mark.parametrize("command", [("point",), ("reset-head", "--yes")])
 def test_a_rig_in_use_is_neither_moved_nor_reset(folder, capsys, resets, command):
     with rig_lock(file=folder / "hw.toml"):
-        assert "another program has the rig of hw.toml" in refused(capsys, *command, "--rig", "hw.toml")
+        assert "the rig of hw.toml is open already" in refused(capsys, *command, "--rig", "hw.toml")
     assert resets == []
 
 

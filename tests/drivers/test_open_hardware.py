@@ -16,7 +16,7 @@ from cotarget.drivers.board import BoardSettings
 from cotarget.drivers.gphoto_camera import GphotoSettings
 from cotarget.drivers.interlock import rig_lock
 from cotarget.drivers.link_errors import InUseError
-from cotarget.drivers.ptu_d46 import D46Head, D46Settings
+from cotarget.drivers.ptu_d46 import D46Settings
 from cotarget.drivers.rig import device_of, open_hardware
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.plugins import load
@@ -152,8 +152,6 @@ def test_a_rig_in_use_is_refused_before_a_device_is_opened(devices, port, tmp_pa
         log.clear()
         with pytest.raises(InUseError):
             open_hardware(second)
-        with pytest.raises(InUseError):
-            D46Head.probe(D46Settings(port=names[1]))
         assert log == []
     missing.append("zoom")
     with pytest.raises(DeviceError, match="zoom: is not there"):
@@ -171,6 +169,7 @@ class Settings:
     host: str = ""
     port: int = 0
     dome_url: str = ""
+    at: str = ""
     spec = HeadSpec(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), 1.0, 1.0, 0.0), 0.0)
 
 class Head:
@@ -186,6 +185,9 @@ Head.Settings = Settings
     ({"host": "192.0.2.1"}, {"host": "192.0.2.1", "port": 80}),
     ({"host": "127.0.0.1", "port": 4001}, {"host": "localhost", "port": 4001}),
     ({"dome_url": "http://192.0.2.1/ptz"}, {"dome_url": "http://192.0.2.1:80/ptz/"}),
+    ({"at": "192.0.2.7", "port": 4001}, {"at": "192.0.2.7", "port": 4001}),
+    ({"at": "::1", "port": 4001}, {"host": "localhost", "port": 4001}),
+    ({"at": "/dev/null"}, {"at": "/dev/null"}),
 ])  # fmt: skip
 def test_a_head_of_ones_own_is_locked_by_its_address_whatever_the_key(tmp_path, table, other):
     (tmp_path / "own.py").write_text(OWN_HEAD)
@@ -196,6 +198,13 @@ def test_a_head_of_ones_own_is_locked_by_its_address_whatever_the_key(tmp_path, 
             second.probe()
         assert device_of("head", driver | {"host": "192.0.2.1", "port": 4002}).probe() == "asked"
     assert second.probe() == "asked"
+
+
+def test_a_head_derived_from_a_drivers_class_is_asked_and_reset_like_it(tmp_path, monkeypatch):
+    """It takes no second lock of its own address."""
+    (tmp_path / "own.py").write_text("from cotarget.drivers.ptu_d46 import D46Head\n\nclass Head(D46Head):\n    pass\n")
+    with pytest.raises(DeviceError, match="no port"):
+        device_of("head", {"driver": f"{tmp_path}/own.py:Head", "port": "/dev/none"}).probe()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the devices have to refuse a second program")

@@ -286,6 +286,28 @@ def test_a_servo_arrives_within_its_slack_and_never_loses_its_position(tmp_path,
     PolledHead(lambda: link, settings, link.clock).close()  # no marker keeps it from being opened again
 
 
+class SaggingLink(ServoLink):
+    """A servo that sags by two steps wherever it is sent, and tells its goal."""
+
+    def poll(self):
+        return [poll._replace(position=poll.position + self.off) for poll in CounterLink.poll(self)]
+
+    def goals(self):
+        return tuple(self.at)
+
+
+def test_an_axis_that_is_sent_to_where_it_stands_keeps_its_goal(tmp_path, monkeypatch):
+    """As `point` does with an axis that is not asked for, from one program to the next."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    link, settings = SaggingLink(SimClock()), PolledHeadSettings(**SETTINGS)
+    link.at = [10, 0]
+    for pan in (20, 30):
+        head = PolledHead(lambda: link, settings, link.clock)
+        head.move(pan * STEP, head.state().tilt, wait=True)
+        head.close()
+        assert link.at == [pan, 0]
+
+
 def test_axes_of_two_scales(opened, link):
     """Advice that is followed is right."""
     link.axes = (FACTS, replace(FACTS, step=STEP / 2, lowest=-1800, highest=1800, fastest=2000))
