@@ -199,7 +199,7 @@ class CameraRun:
         self.tracks: list[Track] = []
 
     def track(self, frame: Frame) -> Detections:
-        """Detect the targets of a frame, which hold the tracks of the last one, and update the tracks."""
+        """Detect the targets of a frame, given the tracks after the last one, and update the tracks."""
         found = self._detector.detect(frame, self.tracks)
         self.tracks = self._tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
         return found

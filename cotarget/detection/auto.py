@@ -167,9 +167,9 @@ class AutoDetector:
         self._moved = moved
 
 
-def _mask(background: Detections, apart: Sequence[Detection]) -> Image | None:
+def _mask(background: Detections, apart: Sequence[Detection]) -> Image:
     """Give the foreground of the background model, and boxes of small targets elsewhere by their score."""
-    large = background.mask
+    large = np.asarray(background.mask)
     boxes = np.zeros_like(large)
     for each in reversed(apart):
         first = np.rint(each.center_px - (each.size_px - 1) / 2).astype(int)

@@ -347,7 +347,7 @@ class _Camera:
         elif self._newest is not None and self._newest[0] == name:
             image = self._newest[1]
         else:
-            read = cv2.imread(str(self._directory / name), cv2.IMREAD_COLOR)
+            read = cv2.imread(str(self._directory / name), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
             if read is None:
                 raise DeviceError(f"{self._directory / name}: is damaged, so the replay ends here")
             image = np.asarray(read, dtype=np.uint8)

@@ -88,7 +88,9 @@ def _jpeg(path: Path) -> bytes:
         data = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; --results names the folder of their results") from None
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    image = (
+        cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if data else None
+    )
     if image is None:
         raise ConfigError(f"{path} is no picture; run its experiment again, with --fresh")
     height, width = image.shape[:2]

@@ -126,7 +126,12 @@ def test_v010_rig_files_name_every_key():
     free = ("sim.models.", "sim.paths.", "hardware.zoom.settings.")  # whose keys are names
     found = {next((start[:-1] for start in free if key.startswith(start)), key) for key in found}
     found = {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in found}
-    newer = {"targets.book.shape", "targets.book.network", *(f"hardware.{name}.driver" for name in DRIVERS)}
+    newer = {
+        "targets.book.shape",
+        "targets.book.network",
+        "hardware.fixed.password_env",
+        *(f"hardware.{name}.driver" for name in DRIVERS),
+    }
     assert {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in KEYS} - newer == found
 
 
