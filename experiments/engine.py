@@ -465,23 +465,18 @@ def on_dask(processes: int, scheduler: str | None) -> Iterator[Run]:
 
 
 def alone(jobs: Sequence[Job]) -> Iterator[tuple[Job, Done]]:
-    """Run jobs one after the other in a process of their own, which may use any number of threads."""
-    with contextlib.ExitStack() as pools:
-
-        def opened() -> ProcessPoolExecutor:
-            context = multiprocessing.get_context("spawn")  # a forked process would share the parent's OpenGL
-            return pools.enter_context(ProcessPoolExecutor(1, context, end_with_parent))
-
-        pool = opened()
-        for job in jobs:
+    """Run jobs one after the other, each in a process of its own, which may use any number of threads."""
+    context = multiprocessing.get_context("spawn")  # a forked process would share the parent's OpenGL
+    for job in jobs:
+        with ProcessPoolExecutor(1, context, end_with_parent) as pool:
+            with interrupts_kept_from_children():
+                future = pool.submit(perform, job.case.experiment.one, job.case.settings, job.number)
             try:
-                with interrupts_kept_from_children():
-                    future = pool.submit(perform, job.case.experiment.one, job.case.settings, job.number)
                 done = future.result()
             except BrokenProcessPool:
-                done, pool = Done(version=code_version(), failed=DIED), opened()
-            except BaseException:
+                done = Done(version=code_version(), failed=DIED)
+            except BaseException:  # the run ends
                 for process in multiprocessing.active_children():
                     process.terminate()
                 raise
-            yield job, done
+        yield job, done
