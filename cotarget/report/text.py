@@ -26,7 +26,6 @@ from cotarget.report.analysis import (
     BoardShape,
     Evidence,
     analyse,
-    averaged,
     corner_errors,
     empty_places,
     head_poses,
@@ -46,126 +45,90 @@ ACTIONS = {
     "the zoom camera's place on the head": NEARER,
     "the head's axes": NEARER,
     "the encoders": "calibrate with --encoders, and move both pan and tilt from end to end",
+    JITTER_GROUP: "look for play in the gears, cables that pull, a mount that gives way, and wait longer after a move",
 }
 WORTH_SAYING = 0.1  # share of the squared error from which a group is mentioned
 MUCH_WORSE = 3.0  # ratio of errors from which a place or focal length is mentioned
-PATTERN = 0.1  # share of cells' averages beyond chance that makes a pattern, nine times what chance gives
 FAR_SHARE, FEW_FAR = 0.5, 0.25  # share of the way from near to far beyond which boards are far; smallest share of these
 LEAST_TURN = np.radians(10.0)  # smallest range of each axis of the head over all poses
 TURNED, FEW_TURNED = np.radians(20.0), 1 / 3  # tilt that determines the focal length; smallest share of boards with it
 FEWEST_AT_STOP = 6  # fewest views of a zoom sample
 FEWEST_SHARED = 5  # fewest placements seen by both cameras, so that some can be kept out
-MANY_REJECTED, MANY_WRONG = 0.2, 0.01  # largest shares of rejected images and of wrong corners
+MANY_WRONG = 0.01  # largest share of wrong corners
 
 
 def advice(calibration: Calibration, found: Analysis) -> list[str]:
-    """Advise how to improve a calibration, roughly the most useful first; empty where nothing stands out."""
-    at, evidence = found.at, found.evidence
-    items = [*_disagreement(calibration), *_missing(calibration), *_unconfirmed(calibration)]
+    """List what to do about a calibration, roughly the most useful first; empty where nothing stands out."""
+    evidence = found.evidence
     wrong_board = evidence is not None and evidence.shape.wrong
+    items = [*_missing(calibration)]
     if evidence is not None and wrong_board:
-        items.append(_another_board(evidence.shape))
+        bent = evidence.shape.out > evidence.shape.within
+        mend = (
+            "Mount the board on something flat and rigid" if bent else "Print the board, measure its squares both ways"
+        )
+        items.append(f"{mend}, and capture all images again: more of this board do not help.")
     else:
-        items += _largest_part(at, found.parts)
-    items += [*_between_stops(at, found.between), *_worst_corner(calibration, at)]
+        items += _largest_parts(found)
+    items += _worst_places(calibration, found)
     if evidence is not None:
-        items += _images(calibration, evidence)
-        items += [] if wrong_board else _patterns(evidence)
-        items += _situation(calibration, evidence)
-        items += [] if wrong_board else _more_of_the_same(calibration, at)
+        items += [*_boards(calibration, evidence), *_head_and_lens(calibration, evidence)]
+        items += [] if wrong_board else _more_of_the_same(calibration, found.at)
     return items
 
 
 def _missing(calibration: Calibration) -> Iterator[str]:
-    """Advise on what the calibration lacks: undetermined parameters, a head, a covariance."""
+    """Advise on a wrong model, and on what the calibration lacks."""
+    held_out = calibration.held_out
+    if held_out is not None and held_out.widened > 1:
+        yield (
+            "Look for a board that is bent or not printed to scale, a mount that gives way, a lens that moved between "
+            "captures: more captures do not help."
+        )
     if open_ := left_open(calibration):
         yield f"Add what is missing: {open_}."
     if calibration.zoom_head.T_head_zoom is None:
         yield "Calibrate on a rig whose head moves: two cameras alone cannot be pointed."
     if calibration.provenance.get("method") == "sequential":
-        yield "Calibrate again by the joint method, from the same captures: it points better and says how well."
+        yield "Calibrate again by the joint method, from the same captures."
     elif calibration.covariance is None:
-        yield "Add captures until the method gives an uncertainty: more placements, near and far, in both cameras."
-
-
-def _disagreement(calibration: Calibration) -> Iterator[str]:
-    """Advise where captures kept out of the fit disagree with it."""
-    held_out = calibration.held_out
-    if held_out is not None and held_out.widened > 1:
-        yield (
-            f"Captures kept out miss {digits(held_out.widened)} times as far as they should: the model is wrong "
-            "somewhere. Look for a board that is bent or not printed to scale, a mount that gives way, a lens that "
-            "moved between captures. More captures do not help."
-        )
-
-
-def _unconfirmed(calibration: Calibration) -> Iterator[str]:
-    """Advise where there were too few placements to keep any out of the fit."""
-    if calibration.held_out is None and calibration.covariance is not None and calibration.provenance.get("folds"):
+        yield "Add placements, near and far, in both cameras, until the method gives an uncertainty."
+    elif held_out is None and calibration.provenance.get("folds"):
         shared = [{v.board for v in calibration.views if v.camera == camera} for camera in CAMERAS]
         number = len(shared[0] & shared[1])
         yield (
             f"Show both cameras {FEWEST_SHARED} placements or more ({number} so far), so that some can be kept out of "
-            "the fit and confirm it."
+            "the fit."
         )
 
 
-def _largest_part(at: tuple[AtFocal, ...], parts: dict[str, float]) -> Iterator[str]:
+def _largest_parts(found: Analysis) -> Iterator[str]:
     """Advise on the groups of parameters that contribute most to the error."""
-    total = at[-1].rms if at else 0.0
-    if not total > 0:
-        return
-    for group, left in list(parts.items())[:2]:
-        share = 1 - (left / total) ** 2
-        if not share > WORTH_SAYING:
-            return
-        gain = f"the error would be {_degrees(left)} instead of {_degrees(total)} degrees"
-        if group == JITTER_GROUP:
+    total = found.at[-1].rms if found.at else 0.0
+    for group, left in list(found.parts.items())[:2] if total > 0 else ():
+        if 1 - (left / total) ** 2 > WORTH_SAYING:
             yield (
-                f"The head itself makes {percent(share)} of the squared error; without its jitter {gain}. Look for "
-                "play in the gears, cables that pull, a mount that gives way, and wait longer after a move; more "
-                "captures will not help."
+                f"Without the part of {group} the error would be {_degrees(left)} instead of {_degrees(total)} "
+                f"degrees: {ACTIONS.get(group, BOTH)}."
             )
-        else:
-            yield f"Were {group} known exactly, {gain}: {ACTIONS.get(group, BOTH)}."
 
 
-def _between_stops(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Iterator[str]:
-    """Advise where the zoom lens is interpolated too far between zoom samples."""
-    worst = max(between, key=lambda one: one.rms, default=None)
-    if worst is not None and worst.rms > MUCH_WORSE * max(stop.rms for stop in at):
-        yield (
-            f"Between the zoom samples the lens is only interpolated: at a nominal {worst.nominal_px:.0f} px the error "
-            f"is {_degrees(worst.rms)} degrees. Add a sample there."
-        )
-
-
-def _worst_corner(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator[str]:
-    """Advise where pointing is much worse in a corner of the fixed image than in its middle."""
-    if not at:
+def _worst_places(calibration: Calibration, found: Analysis) -> Iterator[str]:
+    """Advise where pointing is much worse than elsewhere: between zoom samples, or in a corner of the fixed image."""
+    if not found.at:
         return
-    middle, corners = corner_errors(calibration, at[-1].nominal_px)
+    worst = max(found.between, key=lambda one: one.rms, default=None)
+    if worst is not None and worst.rms > MUCH_WORSE * max(stop.rms for stop in found.at):
+        yield (
+            f"Add a zoom sample at a nominal {worst.nominal_px:.0f} px, where the lens is only interpolated: the error "
+            f"is {_degrees(worst.rms)} degrees."
+        )
+    middle, corners = corner_errors(calibration, found.at[-1].nominal_px)
     name, error = max(corners.items(), key=lambda item: item[1], default=("", 0.0))
     if error > MUCH_WORSE * middle:
         yield (
-            f"In the {name} corner of the fixed image the error is {_degrees(error)} degrees, {digits(error / middle)} "
-            "times that in the middle: hold boards there, as far out as they are still seen."
-        )
-
-
-def _images(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
-    """Advise where many images or corners were left out."""
-    residuals = calibration.residuals
-    if residuals is None:
-        return
-    used, rejected = residuals.fixed_views + residuals.zoom_views, len(residuals.rejected)
-    if rejected > MANY_REJECTED * (used + rejected):
-        yield f"{rejected} of {used + rejected} images were not used; the reasons are above."
-    corners = sum(len(evidence.corners[name].seen_px) for name in CAMERAS)
-    if residuals.outliers > MANY_WRONG * corners:
-        yield (
-            f"{count(residuals.outliers, 'corner')} of {corners + residuals.outliers} were left out as wrong: look for "
-            "blur, glare, and a board that is not flat."
+            f"Hold boards in the {name} corner of the fixed image, as far out as they are still seen: the error there "
+            f"is {digits(error / middle)} times that in the middle."
         )
 
 
@@ -180,74 +143,41 @@ def board_in_words(shape: BoardShape) -> str:
     )
 
 
-def _another_board(shape: BoardShape) -> str:
-    """Advise on a wrong board, for which more captures of it, or another lens, are no remedy."""
-    remedy = (
-        "It is bent: mount it on something flat and rigid"
-        if shape.out > shape.within
-        else "It is stretched: print it again, and measure its squares both ways"
-    )
-    return (
-        f"{board_in_words(shape)} {remedy}, and capture all images again. More captures of this board do not help, and "
-        "the predicted error leaves its shape out."
-    )
-
-
-def _patterns(evidence: Evidence) -> Iterator[str]:
-    """Advise where the residuals show a pattern in an image, which no shape of the board explains."""
+def _boards(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
+    """Advise on how boards were held and seen."""
+    corners = sum(len(evidence.corners[name].seen_px) for name in CAMERAS)
+    if calibration.residuals is not None and calibration.residuals.outliers > MANY_WRONG * corners:
+        wrong = count(calibration.residuals.outliers, "corner")
+        yield f"Look for blur, glare, and a board that is not flat: {wrong} were left out as wrong."
     for name in CAMERAS:
-        cells = averaged(evidence.corners[name])
-        known, beyond = int(np.isfinite(cells.means[:, 0]).sum()), int(cells.beyond_chance.sum())
-        if beyond > PATTERN * known:
-            yield (
-                f"The {TITLES[name]}'s residuals have a pattern: {beyond} of {known} averages are larger than chance "
-                "makes them. The lens may bend the image as its model cannot, or the board is bent."
-            )
-
-
-def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
-    """Advise where boards, head poses or focal lengths were not covered."""
-    for name in CAMERAS:
-        places = empty_places(evidence.corners[name])
-        if places:
-            yield (
-                f"Hold boards where the {TITLES[name]} saw none: at the {listed(places)} of its image. The predicted "
-                "error there is an extrapolation."
-            )
+        if places := empty_places(evidence.corners[name]):
+            yield f"Hold boards where the {TITLES[name]} saw none: at the {listed(places)} of its image."
     number = len(evidence.distances)
     turned = int(np.count_nonzero(evidence.leanings >= TURNED))
     if turned < FEW_TURNED * number:
         yield f"Only {turned} of {count(number, 'placement')} were turned by 20 degrees or more: {TILT_BOARDS}."
     if calibration.zoom_head.T_head_zoom is None or calibration.board is None:
         return
-    lens = calibration.zoom_head.lens
     limit = distance(calibration.board, calibration.fixed.lens, FAR_SHARE)
     far = int(np.count_nonzero(evidence.distances > limit))
     if far < FEW_FAR * number:
-        yield (
-            f"Only {far} of {count(number, 'placement')} are farther than {digits(limit)} m: add far ones, which "
-            "determine the directions of the cameras best."
-        )
-    poses = head_poses(evidence.views)
+        yield f"Only {far} of {count(number, 'placement')} are farther than {digits(limit)} m: add far ones."
+
+
+def _head_and_lens(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
+    """Advise on head poses and focal lengths that were not covered."""
+    if calibration.zoom_head.T_head_zoom is None:
+        return
+    lens, poses = calibration.zoom_head.lens, head_poses(evidence.views)
     for axis, turn in zip(("pan", "tilt"), np.ptp(poses, axis=0) if len(poses) else (), strict=False):
         if turn < LEAST_TURN:
             yield f"The head's {axis} changed by {digits(np.degrees(turn))} degrees in all: {NEARER}."
     for nominal, views in zip(lens.nominal_px, evidence.per_stop, strict=True):
         if views < FEWEST_AT_STOP:
-            yield (
-                f"The zoom sample at {nominal:.0f} px has {count(views, 'view')}: add some, {FEWEST_AT_STOP} at least."
-            )
-    if (longest := uncalibrated_px(calibration)) is not None:
-        yield (
-            f"The lens goes to a nominal {longest:.0f} px, but was calibrated to {lens.nominal_px[-1]:.0f} px: no part "
-            f"of a board was seen beyond. To calibrate these too, {FARTHER}: several corners must be in the zoom image."
-        )
+            yield f"The zoom sample at {nominal:.0f} px has {count(views, 'view')}: add some, to {FEWEST_AT_STOP}."
     zooms = any(view.focal_px is not None for view in evidence.views if view.camera == "zoom")
     if zooms and len(lens.stops) == 1:
-        yield (
-            f"Only one focal length was calibrated, a nominal {lens.nominal_px[0]:.0f} px. If the lens zooms, capture "
-            "boards at several: an error shows most at the longest."
-        )
+        yield "If the lens zooms, capture boards at several focal lengths."
 
 
 def _more_of_the_same(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator[str]:
@@ -255,17 +185,15 @@ def _more_of_the_same(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iter
     total = at[-1].rms if at else 0.0
     if not total > 0:
         return
-    number = placements(calibration)
-    text = (
-        f"{MORE_PLACEMENTS} more placements of the same kind as these {number} would bring the error from "
-        f"{_degrees(total)} to {_degrees(with_more_placements(calibration, at[-1]))} degrees"
-    )
-    stays2 = what_stays(calibration, at[-1]) ** 2
+    number, stays2 = placements(calibration), what_stays(calibration, at[-1]) ** 2
+    half = "no number of them would halve it, because the head's jitter stays"
     if 4 * stays2 < total**2:
         more = int(np.ceil(number * ((total**2 - stays2) / (total**2 / 4 - stays2) - 1)))
-        yield f"{text}; {more} more would halve it."
-    else:
-        yield f"{text}; no number of them would halve it, because the head's jitter stays."
+        half = f"{more} more would halve it"
+    yield (
+        f"{MORE_PLACEMENTS} more placements of the same kind as these {number} would bring the error from "
+        f"{_degrees(total)} to {_degrees(with_more_placements(calibration, at[-1]))} degrees; {half}."
+    )
 
 
 def _degrees(angle: float) -> str:
@@ -314,7 +242,8 @@ def parameter_tables(calibration: Calibration) -> list[Table]:
     """Make tables of all parameters in groups, with value ± one standard deviation."""
     head = calibration.zoom_head
     fixed = _lens(calibration, calibration.fixed.lens, "fixed")
-    tables = [Table("Fixed camera", HEADER, fixed, _about_k3(calibration)), *_zoom(calibration)]
+    about_k3 = _about_k3(calibration.fixed.lens, sigma_of(calibration, "fixed.k3"))
+    tables = [Table("Fixed camera", HEADER, fixed, about_k3), *_zoom(calibration)]
     tables.append(_pose_table(calibration, "Offset between the cameras", "T_zoom0_fixed", head.T_zoom0_fixed))
     if head.T_head_zoom is not None:
         tables.append(_pose_table(calibration, "Place of the zoom camera on the head", "T_head_zoom", head.T_head_zoom))
@@ -336,17 +265,12 @@ def _row(
     return words, value_and_sigma(factor * value, sigma and factor * sigma), unit
 
 
-def _held(lens: Intrinsics) -> str:
-    return f"k3 is held at {digits(lens.distortion[4], 3)}." if lens.distortion[4] else "k3 is held at 0."
-
-
-def _about_k3(calibration: Calibration) -> str:
-    k3, sigma = calibration.fixed.lens.distortion[4], sigma_of(calibration, "fixed.k3")
-    if sigma is None:
-        return _held(calibration.fixed.lens)
-    if not k3:
-        return f"k3 is held at 0; the corners suggest {digits(sigma, 1)}, which every uncertainty here includes."
-    return f"k3 is significant: {value_and_sigma(k3, sigma)}. Beyond the boards such a lens is less certain."
+def _about_k3(lens: Intrinsics, sigma: float | None = None) -> str:
+    k3 = lens.distortion[4]
+    if k3 and sigma:
+        return f"k3 is significant: {value_and_sigma(k3, sigma)}. Beyond the boards such a lens is less certain."
+    suggested = f"; the corners suggest {digits(sigma, 1)}, which every uncertainty here includes" if sigma else ""
+    return f"k3 is held at {digits(k3, 3)}{suggested}."
 
 
 def _numbers(lens: Intrinsics) -> dict[str, float]:
@@ -364,7 +288,7 @@ def _zoom(calibration: Calibration) -> list[Table]:
     lens = calibration.zoom_head.lens
     if len(lens.stops) == 1:
         title = f"Zoom camera (nominal focal length {lens.nominal_px[0]:.0f} px)"
-        return [Table(title, HEADER, _lens(calibration, lens.stops[0], "zoom[0]"), _held(lens.stops[0]))]
+        return [Table(title, HEADER, _lens(calibration, lens.stops[0], "zoom[0]"), _about_k3(lens.stops[0]))]
     lengths, bent = [], []
     for i, (nominal, stop, pupil) in enumerate(zip(lens.nominal_px, lens.stops, lens.pupil, strict=True)):
         cells = {name: _row(calibration, f"zoom[{i}].{name}", "", value)[1] for name, value in _numbers(stop).items()}
@@ -533,7 +457,6 @@ FAR_OFF, OUT_OF_SIGHT = 0.05, 0.5
 # smallest recorded rms, for exact corners, which are rounded.
 CONTRADICTION, RECORDED_FLOOR_PX = 3.0, 1e-3
 TOO_CAREFUL = 0.6  # ratio of measured to predicted misses below which the covariance is too large, beyond chance
-MOSTLY = 0.5  # share of the squared error from which jitter is most of it
 
 
 @dataclass(frozen=True)
@@ -568,7 +491,7 @@ def judge(calibration: Calibration, found: Analysis | None = None) -> Verdict:
             f"the lens goes to {longest:.0f} px and is not calibrated beyond these; to calibrate them too, {FARTHER}"
         )
     if calibration.jitter:
-        doubts.append(_jitter(calibration, at[-1]))
+        doubts.append(f"the head misses what it reports by {digits(np.degrees(calibration.jitter))} degrees an axis")
     if evidence is not None and evidence.shape.wrong:
         size = digits(1000 * np.hypot(evidence.shape.within, evidence.shape.out))
         doubts.append(f"not counting that the board's corners are {size} mm off their nominal positions")
@@ -615,14 +538,6 @@ def _how_well(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> str:
     return f"{text}, one standard deviation, all over the fixed image from {near:g} to {far:g} m"
 
 
-def _jitter(calibration: Calibration, last: AtFocal) -> str:
-    share = min(2 * calibration.jitter**2 / last.rms**2, 1.0)
-    angle = digits(np.degrees(calibration.jitter))
-    if share > MOSTLY:
-        return f"most of it because the head misses what it reports by {angle} degrees an axis"
-    return f"including the {angle} degrees by which each axis of the head misses what it reports"
-
-
 def _mismatch(calibration: Calibration) -> list[str]:
     """Describe the disagreement of captures kept out of the fit, which widens every other figure, if any."""
     held_out = calibration.held_out
@@ -655,11 +570,7 @@ def _without_head(calibration: Calibration) -> str:
 
 def _without_covariance(calibration: Calibration) -> Verdict:
     method = calibration.provenance.get("method")
-    residuals = calibration.residuals
-    fits = ""
-    if residuals is not None and residuals.handeye_rms_px is not None:
-        fits = f"; its corners are explained to {digits(residuals.handeye_rms_px)} px, which says little of pointing"
     if method == "joint":
-        return Verdict(f"Leaves parameters undetermined, so that it cannot say how well it points{fits}.", "bad")
+        return Verdict("Leaves parameters undetermined, so that it cannot say how well it points.", "bad")
     why = "the sequential method gives no uncertainty" if method == "sequential" else "it has no uncertainty"
-    return Verdict(f"Does not say how well it points, because {why}{fits}.", "unknown")
+    return Verdict(f"Does not say how well it points, because {why}.", "unknown")

@@ -187,6 +187,8 @@ def without_covariance(method):
     (lambda c: without_covariance(""), "unknown", "has no uncertainty"),
     (lambda c: {"zoom_head": replace(c.zoom_head, T_head_zoom=None)}, "unknown", "without a head"),
     (lambda c: {"provenance": {"focal_range_px": [667.0, 2001.0]}}, "care", "the lens goes to 2001 px"),
+    (lambda c: {"provenance": {"focal_range_px": [667.0, 2001.0]}}, "care", "show a larger board farther away"),
+    (lambda c: {"provenance": {"focal_range_px": [667.0, 667.0]}}, "good", "captures kept out of the fit agree"),
 ])  # fmt: skip
 def test_verdict_levels(plain, changed, level, said):
     found = judge(bare(plain, **changed(plain)))
@@ -203,7 +205,7 @@ def test_widening_does_not_make_parameters_undetermined(plain):
     assert "not determine" in judge(replace(wrong, held_out=plain.held_out)).text
     assert "does not determine the rig" in judge(replace(wrong, covariance=wide.scaled({"T_head_zoom.rx": 1e6}))).text
     words = advice(wrong, UNKNOWN)
-    assert words[0].startswith("Captures kept out miss 3000 times")
+    assert "more captures do not help" in words[0]
     assert not any("Add what is missing" in item for item in words)
 
 
@@ -277,16 +279,6 @@ def test_view_with_corners_on_one_line_is_left_out_of_the_report(plain, caplog):
         assert caplog.messages == ["line.png: not in the report: its corners are too few, or all on one line"]
 
 
-def test_advice_names_an_uncalibrated_focal_range(plain):
-    longest = plain.zoom_head.lens.nominal_px[-1]
-    for factor, named in ((1, False), (3, True)):
-        changed = replace(plain, provenance={"focal_range_px": [667.0, factor * longest]})
-        said = advice(changed, replace(UNKNOWN, evidence=gather(changed)))
-        assert any("but was calibrated to 667 px" in item for item in said) == named
-        remedies = [judge(bare(changed)).text, *said]
-        assert sum("show a larger board farther away" in text for text in remedies) == 2 * named
-
-
 def test_wavy_board_is_noticed(plain):
     bent = POINTS.copy()
     bent[:, 2] = 0.003 * np.sin(12 * POINTS[:, 0])  # waves, which no parabola takes up
@@ -300,13 +292,9 @@ def test_wavy_board_is_noticed(plain):
     verdict, words = judge(calibration, found), advice(calibration, found)
     assert verdict.level == "care"
     assert "not counting that the board's corners are 1." in verdict.text
-    (item,) = (item for item in words if "the board's 54 corners" in item)
-    assert "mount it on something flat and rigid" in item
-    assert "More captures of this board do not help" in item
+    assert any("mount the board on something flat and rigid" in item.lower() for item in words)
     # Nothing that more images of the same board, or another lens, would mend.
-    assert not any(
-        "more placements" in each or "known exactly" in each or "residuals have a pattern" in each for each in words
-    )
+    assert not any("more placements" in each or "Without the part" in each for each in words)
     stretched = replace(evidence.shape, offsets=evidence.shape.offsets[:, [2, 1, 0]])
     words = advice(calibration, replace(found, evidence=replace(evidence, shape=stretched)))
     assert any("measure its squares both ways" in item for item in words)
@@ -336,8 +324,7 @@ def test_advice_follows_from_the_figures(plain):
     found = replace(analyse(plain), between=())
     at, words = found.at, advice(plain, found)
     group, left = next(iter(found.parts.items()))
-    assert f"Were {group} known exactly" in words[0]
-    assert f"the error would be {digits(np.degrees(left))} instead" in words[0]
+    assert f"Without the part of {group} the error would be {digits(np.degrees(left))} instead" in words[0]
     assert any("36 more would halve it" in item for item in words)  # a quarter of the variance takes 4 * 12
     assert with_more_placements(plain, at[0], 36) == pytest.approx(at[0].rms / 2)
     still = replace(plain, views=tuple(replace(v, tilt=0.0) if v.camera == "zoom" else v for v in plain.views))
@@ -349,8 +336,9 @@ def test_advice_follows_from_the_figures(plain):
     words = advice(shaky, Analysis((much,), (), {JITTER_GROUP: at[0].rms}, None))
     words += advice(shaky, analyse(shaky))
     between = (replace(at[0], nominal_px=777.0, rms=4 * at[0].rms),)
-    assert any("777 px" in item and "Add a sample" in item for item in advice(plain, replace(found, between=between)))
-    assert any("makes 99 % of the squared error" in item for item in words)
+    assert any(
+        "777 px" in item and "Add a zoom sample" in item for item in advice(plain, replace(found, between=between))
+    )
     assert any("play in the gears" in item for item in words)
     assert any("no number of them would halve it" in item for item in words)
 
