@@ -25,13 +25,6 @@ def test_an_extra_is_installed_by_what_it_needs(extra):
     assert sorted(words[4:]) == sorted(PROJECT["optional-dependencies"][extra]) != []
 
 
-def test_nothing_advises_to_install_cotarget_from_an_index():
-    files = [path for folder in ("cotarget", "experiments", "docs") for path in (ROOT / folder).rglob("*.[pm][yd]")]
-    assert len(files) > 100
-    advice = re.compile(r"pip install [^`&\n]*\bcotarget\b")
-    assert [path for path in (*files, ROOT / "README.md") if advice.search(path.read_text(encoding="utf-8"))] == []
-
-
 def test_version_licence_and_authors_are_the_same_everywhere():
     cited = dict(re.findall(r"^([a-z-]+): (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE))
     assert PROJECT["version"] == cotarget.__version__ == cited["version"]

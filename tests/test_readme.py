@@ -20,8 +20,6 @@ EXAMPLE = "rounding"  # the experiment that docs/experiments.md adds
 HISTORY = ("upgrading.md", "CHANGELOG.md")  # these name what there was
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
 TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES if page.name not in HISTORY)
-MOST_LINES, MOST_WORDS, MOST_PYTHON = 150, 1200, 8  # of README: its lines and words, and lines of its Python
-FIRST_SCREEN = 20  # lines
 # `cotarget NAME ... --option ...` up to where a line of code or of a shell ends.
 COMMANDS = re.findall(r"(?<![\w/.-])cotarget ([a-z-]+)((?: [^`\n|#]*)?)", TEXT)
 # `python -m experiments[.name] ...`, of which one line of code follows the other.
@@ -74,15 +72,6 @@ def test_experiments_and_their_options_exist():
 
 def test_every_command_is_documented(helps):
     assert known(asked()) <= set(helps)
-
-
-def test_the_readme_is_a_page_with_python_on_its_first_screen():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= MOST_LINES
-    assert len(text.split()) <= MOST_WORDS
-    assert text[: text.index("```python")].count("\n") < FIRST_SCREEN
-    (block,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert len([line for line in block.splitlines() if line]) <= MOST_PYTHON
 
 
 def section(page, heading):

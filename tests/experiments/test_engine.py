@@ -478,19 +478,6 @@ def test_all_experiments_are_found_and_of_one_shape(capsys):
         assert (experiment.name, bool(experiment.purpose)) == (name, True)
         assert len(experiment.jobs(experiment.quick)) <= len(experiment.jobs(experiment.settings))
         assert experiment.plot is None or experiment.plot.__doc__  # the picture's caption
-    assert {name for name, load in known.items() if load().alone} == {
-        *(
-            "speed",
-            "wire",
-            "sim_speed",
-            "env_speed",
-            "pipeline_speed",
-            "frame_sizes",
-            "turn",
-            "real_time",
-            "sweep_speed",
-        ),
-    }
     assert main(["--list"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == len(known)
 
