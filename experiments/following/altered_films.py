@@ -16,14 +16,15 @@ from cotarget.detection.base import moved
 from cotarget.rig import Frame, Image
 from cotarget.track_metrics import Box, Label, score_tracks
 from cotarget.tracking.track import tracking_settings
-from experiments.engine import Count, Row, Settings
+from experiments.engine import Row
 from experiments.following import films
-from experiments.following.films import FilmsSettings, LabelledFilm, detector_tracks, labelled_film
+from experiments.following.films import FolderSettings, LabelledFilm, detector_tracks, jobs, labelled_film, needs
 from experiments.tables import grouped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+__all__ = ["jobs", "needs"]
 B = TypeVar("B", bound=Box)
 # Largest side of a speck [px], and the part of the specks in smaller films that is wanted.
 SPECK_PX, WANTED = 12.0, 0.9
@@ -32,31 +33,15 @@ SHAKE_PX, DROPPED, QUALITY = 1.0, 0.3, 25
 
 
 @dataclass(frozen=True)
-class AlteredFilmsSettings(Settings):
-    """Settings: most films, as seeds, the folders of films with their labels, and the detector."""
+class AlteredFilmsSettings(FolderSettings):
+    """Settings: the detector."""
 
-    seeds: Count = 1000
-    folders: tuple[str, ...] = FilmsSettings.folders
     detector: DetectorName = "auto"
-
-
-def _films(settings: AlteredFilmsSettings) -> FilmsSettings:
-    return FilmsSettings(seeds=settings.seeds, folders=settings.folders)
-
-
-def needs(settings: AlteredFilmsSettings) -> str:
-    """Describe what is missing to run; empty if nothing."""
-    return films.needs(_films(settings))
-
-
-def jobs(settings: AlteredFilmsSettings) -> Sequence[int]:
-    """Give the films' numbers; one where there is no film."""
-    return films.jobs(_films(settings))
 
 
 def one(settings: AlteredFilmsSettings, number: int) -> list[Row]:
     """Search a film in every alteration; give a row for each."""
-    film = labelled_film(*films.films(_films(settings))[number])
+    film = labelled_film(*films.films(settings)[number])
     least = tracking_settings(replace(DEFAULT_TARGETS["bird"], detector=settings.detector)).confirm_score
     rows = []
     for name, alter in ALTERATIONS.items():

@@ -56,29 +56,35 @@ def off_boxes(tracks: Iterable[Tracked], boxes: Mapping[int, Sequence[Box]], cri
 
 
 @dataclass(frozen=True)
-class FilmsSettings(Settings):
-    """Settings: folders of films with their labels, the detector, what is swept, and most films, as seeds."""
+class FolderSettings(Settings):
+    """Settings of all experiments on films: folders of films with their labels, and most films, as seeds."""
 
     seeds: Count = 1000
     folders: tuple[str, ...] = (str(DATA / "flyers"), str(DATA / "birds"))
+
+
+@dataclass(frozen=True)
+class FilmsSettings(FolderSettings):
+    """Settings: the detector, and what is swept."""
+
     detector: DetectorName = "auto"
     scores: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99)  # from which a track is confirmed
     thresholds: tuple[float, ...] = (9.0, 16.0, 36.0, 100.0, 400.0)  # of MOG2, in variances; KNN's is 25 times as large
     areas_px: tuple[int, ...] = (4, 16, 64, 256)  # smallest of a component
 
 
-def needs(settings: FilmsSettings) -> str:
+def needs(settings: FolderSettings) -> str:
     """Describe what is missing to run; empty if nothing."""
     lacking = [folder for folder in settings.folders if not Path(folder).is_dir()]
     return f"needs films in {lacking[0]}, which are not part of the project" if lacking else ""
 
 
-def films(settings: FilmsSettings) -> list[tuple[Path, Path]]:
+def films(settings: FolderSettings) -> list[tuple[Path, Path]]:
     """List the films and their labels."""
     return [pair for folder in settings.folders for pair in labelled_films(Path(folder), Path(folder))]
 
 
-def jobs(settings: FilmsSettings) -> Sequence[int]:
+def jobs(settings: FolderSettings) -> Sequence[int]:
     """Give the films' numbers; one where there is no film."""
     return range(1 if needs(settings) else min(settings.seeds, len(films(settings))))
 

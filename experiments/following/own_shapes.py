@@ -22,10 +22,10 @@ from cotarget.sim.targets.random_paths import lone_path
 from cotarget.sim.world import SimWorld
 from cotarget.track_metrics import Box, Label, score_tracks
 from cotarget.tracking.track import tracking_settings
-from experiments.engine import Count, Row, Settings
+from experiments.engine import Count, Row
 from experiments.following import films
 from experiments.following.field_scenes import field_config
-from experiments.following.films import FilmsSettings, LabelledFilm, labelled_film, tracks_of
+from experiments.following.films import FolderSettings, LabelledFilm, labelled_film, needs, tracks_of
 from experiments.following.sim_to_real import Clip, draw_polygons, rendered
 from experiments.following.wide_view import WIDE
 from experiments.tables import grouped
@@ -33,6 +33,7 @@ from experiments.tables import grouped
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+__all__ = ["needs"]
 WANTED = 0.95
 EVERY = 5  # the labelled films that are taken: every fifth
 # Composites: length [px], speed [lengths per second], and number of heights of which the farthest from labels is taken.
@@ -113,22 +114,16 @@ SHAPES: Mapping[str, Shape] = {
 
 
 @dataclass(frozen=True)
-class OwnShapesSettings(Settings):
-    """Settings: scenes as seeds, each simulated and a film, folders of films with labels, most frames of each."""
+class OwnShapesSettings(FolderSettings):
+    """Settings: scenes as seeds, each simulated and a film, and most frames of each."""
 
     seeds: Count = 6
-    folders: tuple[str, ...] = FilmsSettings.folders
     frames: Count = 250
-
-
-def needs(settings: OwnShapesSettings) -> str:
-    """Describe what is missing to run; empty if nothing."""
-    return films.needs(FilmsSettings(folders=settings.folders))
 
 
 def _films(settings: OwnShapesSettings) -> list[tuple[Path, Path]]:
     """List the films that are taken, with their labels."""
-    return films.films(FilmsSettings(folders=settings.folders))[::EVERY]
+    return films.films(settings)[::EVERY]
 
 
 def jobs(settings: OwnShapesSettings) -> Sequence[int]:

@@ -25,14 +25,15 @@ from cotarget.files import read_table
 from cotarget.geometry import Array
 from cotarget.track_metrics import LEARNING_FRAMES, Box, Criterion
 from cotarget.tracking.track import tracking_settings
-from experiments.engine import Count, Row, Settings
+from experiments.engine import Count, Row
 from experiments.following import films
-from experiments.following.films import FilmsSettings, LabelledFilm, labelled_film, tracks_of
+from experiments.following.films import FolderSettings, LabelledFilm, labelled_film, needs, tracks_of
 from experiments.tables import grouped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+__all__ = ["needs"]
 PLACES = Path(__file__).with_name("film_places.csv")
 FOLDS = 5
 WITHIN = 0.01  # of the recall with weights fitted to all films
@@ -41,17 +42,11 @@ TARGET = replace(DEFAULT_TARGETS["bird"], detector="auto")
 
 
 @dataclass(frozen=True)
-class ScoreFoldsSettings(Settings):
-    """Settings: fifths of the films, as seeds, folders of films with their labels, and which films are used."""
+class ScoreFoldsSettings(FolderSettings):
+    """Settings: fifths of the films, as seeds, and which films are used."""
 
     seeds: Count = FOLDS
-    folders: tuple[str, ...] = FilmsSettings.folders
     every: Count = 1  # 2 for every second film, and so on
-
-
-def needs(settings: ScoreFoldsSettings) -> str:
-    """Describe what is missing to run; empty if nothing."""
-    return films.needs(FilmsSettings(folders=settings.folders))
 
 
 def jobs(settings: ScoreFoldsSettings) -> Sequence[int]:
@@ -87,7 +82,7 @@ def folds(names: Sequence[str]) -> list[list[int]]:
 @functools.cache
 def _films_and_regions(settings: ScoreFoldsSettings) -> tuple[list[tuple[Path, Path]], list[tuple[Array, Array]]]:
     """Give the films, and the regions examined in each; they are the same for every fifth."""
-    found = films.films(FilmsSettings(folders=settings.folders))[:: settings.every]
+    found = films.films(settings)[:: settings.every]
     return found, [examined(labelled_film(*pair)) for pair in found]
 
 

@@ -32,16 +32,18 @@ from cotarget.sim.world import SimWorld
 from cotarget.track_metrics import LEARNING_FRAMES, Box, Label, Tracked, match_frames
 from cotarget.tracking.track import tracking_settings
 from cotarget.video import Film
-from experiments.engine import Count, Row, Settings
+from experiments.engine import Count, Row
 from experiments.following import films
 from experiments.following.detectors import COME_S
 from experiments.following.field_scenes import five_targets_config
+from experiments.following.films import FolderSettings, needs
 from experiments.following.wide_view import WIDE
 from experiments.tables import grouped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+__all__ = ["needs"]
 Labels = dict[int, list[Label]]  # by frame number
 DETECTOR: DetectorName = "auto"
 WAYS = (DETECTOR, *films.MIXTURES)
@@ -82,11 +84,10 @@ ERROR_WITHIN_PX = 0.3
 
 
 @dataclass(frozen=True)
-class SimToRealSettings(Settings):
-    """Settings: most films of each kind, as seeds, folders of films with labels, and most frames of each."""
+class SimToRealSettings(FolderSettings):
+    """Settings: most films of each kind, as seeds, and most frames of each."""
 
     seeds: Count = 20
-    folders: tuple[str, ...] = films.SETTINGS.folders
     frames: Count = 300
 
 
@@ -99,15 +100,9 @@ class Clip:
     rate_hz: float
 
 
-def needs(settings: SimToRealSettings) -> str:
-    """Describe what is missing to run; empty if nothing."""
-    return films.needs(replace(films.SETTINGS, folders=settings.folders))
-
-
 def jobs(settings: SimToRealSettings) -> Sequence[int]:
     """Give a number for each film and source; one film where there is none."""
-    found = films.jobs(replace(films.SETTINGS, folders=settings.folders, seeds=settings.seeds))
-    return range(len(SOURCES) * len(found))
+    return range(len(SOURCES) * len(films.jobs(settings)))
 
 
 def one(settings: SimToRealSettings, number: int) -> list[Row]:
@@ -273,7 +268,7 @@ def fitted(grey: Image, label: Label) -> Label | None:
 
 def _real(settings: SimToRealSettings, number: int) -> Clip:
     """Read a film and its labels; any first films are a random sample of all."""
-    found = films.films(replace(films.SETTINGS, folders=settings.folders))
+    found = films.films(settings)
     video, file = found[np.random.default_rng(0).permutation(len(found))[number]]
     with Film(video) as film:
         frames, rate = list(itertools.islice(film, settings.frames)), film.rate_hz

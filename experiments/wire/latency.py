@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from cotarget.latency import measure_fixed, measure_head
-from cotarget.rig import Camera, Frame, Speed
+from cotarget.rig import Speed
 from cotarget.safety.safe_rig import guard
 from experiments.engine import Row
-from experiments.wire.command import ORDER, Notes, TimedHead, Turn, open_tapped
+from experiments.wire.command import ORDER, Notes, TimedCamera, TimedHead, Turn, open_tapped
 from experiments.wire.polls import BYTES_S
 from experiments.wire.process import EmulatedRig
 from experiments.wire.rig import Tap, exact_calibration, load
@@ -71,23 +71,6 @@ class Watcher:
                     self.exposures[name].add(*moments)
 
 
-class NotedCamera:
-    """Camera that records the times of its frames."""
-
-    def __init__(self, camera: Camera) -> None:
-        self._camera = camera
-        self.times: set[float] = set()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._camera, name)
-
-    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Read a frame from the camera."""
-        frame = self._camera.read(newer_than, timeout)
-        self.times.add(frame.t)
-        return frame
-
-
 class NotedHead(TimedHead):
     """Head that records each move as a separate turn."""
 
@@ -105,15 +88,15 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
         taps: list[Tap] = []
         with guard(open_tapped(config, taps), config.safety) as rig:
             notes = Notes(rig.clock, 0.0)
-            cameras = {"fixed": NotedCamera(rig.fixed), "zoom": NotedCamera(rig.zoom)}
-            noted = replace(rig, **cameras, head=NotedHead(rig.head, notes))  # type: ignore[arg-type]
+            seen = {name: Notes(rig.clock, getattr(rig.spec, name).latency_s) for name in CAMERAS}
+            devices: dict[str, Any] = {name: TimedCamera(getattr(rig, name), seen[name]) for name in CAMERAS}
+            noted = replace(rig, **devices, head=NotedHead(rig.head, notes))
             found = measure_head(noted, head_seconds)
             orders = true_command_delays(notes, taps[0], emulated.sim.sim.head.command_delay_s)
             calibration = exact_calibration(emulated.sim)
             swing = measure_fixed(noted, calibration, config.board, board_seconds)
         truth = {
-            "fixed": true_latencies(cameras["fixed"], rig.spec.fixed.latency_s, watcher.exposures["fixed"]),
-            "zoom": true_latencies(cameras["zoom"], rig.spec.zoom.latency_s, watcher.exposures["zoom"]),
+            **{name: true_latencies(seen[name], watcher.exposures[name]) for name in CAMERAS},
             "command": orders,
         }
     measured = {
@@ -135,10 +118,9 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
     ]
 
 
-def true_latencies(camera: NotedCamera, latency_s: float, exposures: Exposures) -> list[float]:
+def true_latencies(notes: Notes, exposures: Exposures) -> list[float]:
     """Give the true time from exposure to arrival of each frame of a camera [s]."""
-    arrived = [t + latency_s for t in sorted(camera.times)]
-    return [t - exposures.before(t) for t in arrived]
+    return [t - exposures.before(t) for t in sorted({turn.arrived for turn in notes.turns})]
 
 
 def true_command_delays(notes: Notes, tap: Tap, delay_s: float) -> list[float]:

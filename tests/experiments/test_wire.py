@@ -52,11 +52,11 @@ def test_rests_of_a_head():
 
 def test_true_latencies_of_frames():
     """Images exposed at 1.0 and 1.1 and published 0.06 s later; frames arrive 0.05 s after their stated times."""
-    exposures, camera = latency.Exposures(), latency.NotedCamera(None)
+    exposures = latency.Exposures()
     for exposed, published in ((1.0, 1.06), (1.1, 1.16), (1.1, 1.16)):
         exposures.add(exposed, published)
-    camera.times = {0.9, 1.03, 1.12}
-    assert latency.true_latencies(camera, 0.05, exposures) == pytest.approx([math.nan, 0.08, 0.07], nan_ok=True)
+    notes = Notes(None, 0.05, [Turn(t + 0.05, t) for t in (1.12, 0.9, 1.03, 1.03)])
+    assert latency.true_latencies(notes, exposures) == pytest.approx([math.nan, 0.08, 0.07], nan_ok=True)
 
 
 def test_true_delays_of_commands():
