@@ -5,14 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cotarget import drawing
 from cotarget.drawing import (
     SIZE_KNOWN_S,
     TargetStages,
     aim_error_figure,
     captioned,
     draw_box,
-    draw_frames,
     side_by_side,
     write_text,
 )
@@ -67,13 +65,6 @@ def test_the_picture_of_a_target_enlarges_the_fixed_frame_as_much_as_the_close_u
     top = 2 * picture.shape[0] // 3
     area = (picture[top : top + height, :width, 0] / 255).sum()
     assert area == pytest.approx(4 * 4 * 25, rel=0.1)  # the part that is enlarged has whole pixels
-
-
-def test_the_rigs_frames_have_the_names_of_the_paper(monkeypatch):
-    shown = []
-    monkeypatch.setattr(drawing, "write_text", lambda image, text, *_: shown.extend(text.split(", ")))
-    draw_frames(PICTURE, {"fixed": np.zeros(2), "zoom": np.ones(2), "base": np.ones(2)})
-    assert set(shown) == {"fixed", "zoom0", "base", "head", "Gamma", "T"}
 
 
 VISIBLE = 80  # least difference of something drawn from its background [grey levels]

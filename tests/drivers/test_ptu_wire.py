@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -96,19 +95,6 @@ def test_a_lost_tcp_line_is_an_error_and_cannot_be_opened_again():
             unit.faults.set("unplugged")
             assert "is lost" in fails(head.state)
         assert unit.config.port in fails(lambda: D46Head(unit.config, MonotonicClock()))
-
-
-@pytest.mark.parametrize("fault", ["silence", "half-replies"])
-def test_short_faults_are_recovered_from(stock, fault):
-    with opened(stock) as head:
-        for _ in range(3):
-            stock.faults.set(fault)
-            t = head.state().t
-            time.sleep(0.05)
-            stock.faults.set(fault, False)
-            wait_for(lambda t=t: head.state().t > t + 0.1)
-        head.move(100 * STEP, 0.0, wait=True)
-        assert stock.pan.position() == 100
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import re
 import shutil
 import subprocess
 
@@ -66,26 +65,6 @@ def curl(*arguments):
     return run("curl", "--silent", "--show-error", "--fail", "--max-time", "30", *arguments)
 
 
-def test_curl_takes_a_snapshot():
-    with emulated() as server:
-        image = decoded(curl(f"{server.url}/axis-cgi/jpg/image.cgi?resolution=4CIF&camera=1&compression=30"))
-        assert image.shape == (576, 704, 3)
-        first = number_of(image)
-        assert number_of(decoded(curl(f"{server.url}/jpg/image.jpg"))) >= first
-
-
-def test_curl_takes_a_stream_of_some_frames():
-    with emulated() as server:
-        stream = curl(f"{server.url}{STREAM}?nbrofframes=10&fps=25")
-    parts = re.findall(
-        rb"--myboundary\r\nContent-Type: image/jpeg\r\nContent-Length: \d+\r\n\r\n(\xff\xd8.*?)\r\n(?=--|\Z)",
-        stream,
-        re.S,
-    )
-    assert len(parts) == 10
-    assert consecutive([number_of(decoded(part)) for part in parts])
-
-
 @pytest.mark.parametrize("auth", ["digest", "basic"])
 def test_curl_authenticates_itself(auth):
     with emulated(user="root", password="pass", auth=auth) as server:
@@ -95,16 +74,6 @@ def test_curl_authenticates_itself(auth):
         for more in (["--user", "root:wrong"], []):
             status = run("curl", "--silent", "--output", "-", "--write-out", "%{http_code}", f"--{auth}", *more, target)
             assert status.endswith(b"401")
-
-
-def test_curl_lists_parameters_by_get_and_post():
-    with emulated() as server:
-        target = f"{server.url}/axis-cgi/param.cgi"
-        everything = curl(f"{target}?action=list").decode().splitlines()
-        assert "root.Properties.API.HTTP.Version=2" in everything
-        posted = curl("--data", "action=list", "--data", "group=root.Properties.API", target).decode().splitlines()
-        assert posted == [line for line in everything if line.startswith("root.Properties.API.")]
-        assert curl(f"{target}?action=list&group=X") == b"# Error: Error -1 getting param in group 'X'\n"
 
 
 def ffmpeg_frames(url, count, size=SIZE):

@@ -413,29 +413,3 @@ def test_a_signal_halts_the_head(rig, number, shell):
     assert ("cotarget follow: interrupted" in err) == (number == signal.SIGINT)
     assert watch.rests_since() - at < RESTS_S
     assert stays_within_limits(watch)
-
-
-@pytest.mark.slow
-@moves
-def test_an_emergency_stop_holds_until_it_is_cleared(rig, capsys):
-    at = []
-
-    def stop():
-        wait_until_it_turns(rig)
-        with program("stop", "--rig", rig.hardware_toml, "--reason", "somebody is in the way") as stopping:
-            said = stopping.communicate(timeout=DEADLINE_S)
-        at.append(rig.truth()["t"])
-        assert said == (f"stopped: no head that watches {rig.folder / 'stop'} moves until cotarget clear\n", "")
-
-    why = "cotarget follow: emergency stop: somebody is in the way; when it is safe to move, run 'cotarget clear"
-    with Watch(rig) as watch, meanwhile(stop):
-        status, _, err = run(capsys, *follow(rig, "--seconds", "60"))
-        wait_until_it_rests(rig)
-    assert status == 1
-    assert err.startswith(why)
-    assert len(err.splitlines()) == 1
-    assert watch.rests_since() - at[0] < RESTS_S
-    assert run(capsys, *follow(rig, "--seconds", "60"))[2].startswith(why)
-    assert run(capsys, "clear", "--rig", rig.hardware_toml) == (0, "cleared: somebody is in the way\n", "")
-    # It moves again; so short a run may not see the book.
-    assert run(capsys, *follow(rig, "--seconds", "0.3"))[0] in (0, 4)

@@ -479,15 +479,6 @@ def test_a_recorded_error_is_raised_again(line, tmp_path):
     assert isinstance(caught.value, getattr(errors, base, Exception))
 
 
-def test_recordings_cut_short_are_replayed(old, capsys):
-    log = old / "recording" / "log.jsonl"
-    *lines, end = log.read_text().splitlines(keepends=True)
-    log.write_text("".join(lines))
-    assert run(capsys, "replay", "recording")["steps"] == 6  # the last step may be half a one
-    log.write_text("".join(lines) + end.replace("complete", "HaltedError: the head was halted"))
-    assert run(capsys, "replay", "recording")["steps"] == 7
-
-
 # --- tables, scores and films ---
 
 

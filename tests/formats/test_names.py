@@ -185,14 +185,6 @@ def test_the_commands_have_the_listed_options(monkeypatch):
     assert_listed("commands.txt", lines, begins="cotarget")
 
 
-def test_every_command_answers_help():
-    for line in listed("commands.txt"):
-        if line.count(" ") == 1 and line.startswith("cotarget ") and not line.startswith("cotarget -"):
-            with pytest.raises(SystemExit) as ended:
-                main([line.split()[1], "--help"])
-            assert ended.value.code == 0, line
-
-
 # --- exit statuses ---
 def test_a_command_ends_with_the_listed_status(old, capsys):
     assert main(["stop", "--rig", "rig_recording.toml"]) == statuses()["a command has done what was asked"]
