@@ -28,12 +28,10 @@ from cotarget.report.analysis import (
 from cotarget.report.figures import Plot
 from cotarget.report.text import (
     LABELS,
-    STRONG,
     TOO_CAREFUL,
     Verdict,
     advice,
     board_in_words,
-    correlations,
     count,
     digits,
     judge,
@@ -104,8 +102,6 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
         pointing=_pointing(calibration, analysis),
         tables=parameter_tables(calibration),
         two_columns=TWO_COLUMNS,
-        correlations=correlations(calibration),
-        strong=STRONG,
         residuals=None if analysis.evidence is None else _residuals(analysis.evidence),
         too_careful=TOO_CAREFUL,
         rejected=[] if used is None else [(one.name, one.reason) for one in used.rejected],

@@ -1,7 +1,6 @@
 """Text of the calibration report: verdict, advice, tables of parameters, key figures, and number formatting."""
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -220,9 +219,6 @@ HEAD_WORDS = {  # name, factor to the unit shown, unit
     "pan_zero": ("zero of pan", 180 / np.pi, "degrees"),
     "tilt_zero": ("zero of tilt", 180 / np.pi, "degrees"),
 }
-STRONG = 0.95  # correlation from which a pair is listed
-MOST_CORRELATIONS = 8
-STOP = re.compile(r"\[\d+\]")
 
 
 @dataclass(frozen=True)
@@ -336,26 +332,6 @@ def _head(calibration: Calibration) -> Iterator[tuple[str, ...]]:
         if not of_encoder or sigma_of(calibration, parameter) or value != getattr(IDEAL_HEAD, name):
             yield _row(calibration, parameter, words, value, factor, unit)
     yield "jitter of each axis", digits(float(np.degrees(calibration.jitter))), "degrees"
-
-
-def correlations(calibration: Calibration) -> list[str]:
-    """List the strongest correlations between parameters as text."""
-    covariance = calibration.covariance
-    if covariance is None:
-        return []
-    scale = np.sqrt(np.diagonal(covariance.matrix))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        R = covariance.matrix / np.outer(scale, scale)
-    pairs = [
-        (float(R[i, j]), covariance.parameters[i], covariance.parameters[j])
-        for i, j in zip(*np.triu_indices(len(scale), 1), strict=True)
-        if abs(R[i, j]) > STRONG
-    ]
-    pairs.sort(key=lambda pair: -abs(pair[0]))
-    # Of the same two parameters at several zoom samples, only the strongest correlation is listed.
-    kinds = {tuple(STOP.sub("[]", name) for name in pair[1:]): pair for pair in reversed(pairs)}
-    strongest = sorted(kinds.values(), key=lambda pair: -abs(pair[0]))[:MOST_CORRELATIONS]
-    return [f"{a} with {b}: {r:+.4f}" for r, a, b in strongest]
 
 
 def key_figures(calibration: Calibration) -> list[tuple[str, str]]:

@@ -1,6 +1,7 @@
 """Captures and photos on disk: a malformed index or a missing image is refused in one line with its key."""
 
 import json
+import struct
 
 import cv2
 import numpy as np
@@ -14,13 +15,21 @@ from cotarget.config import BoardConfig, TargetProfile
 from cotarget.detection import make_detector
 from cotarget.drivers.mjpeg import decode_jpeg
 from cotarget.errors import CalibrationError
-from tests.support.exif import COLOURED, tagged
 
 FIXED = {"file": "a.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 2.0}
 ZOOM = {"file": "b.png", "camera": "zoom", "board": 0, "pan": 0.1, "tilt": -0.2, "focal_px": 667.0, "t": 1.0}
 BOARD = {"kind": "chessboard", "corners": [9, 6], "square": 0.1}
 DECODERS_DIFFER = 5  # by two libraries, in the colour at an edge [grey levels]
 LARGE, SMALL = (48, 64), (24, 32)  # height and width [px]
+COLOURED = np.zeros((16, 32, 3), np.uint8)
+COLOURED[..., 1], COLOURED[:8, :8, 2] = 200, 255  # one corner differs, so that a turn shows
+
+
+def tagged(orientation):
+    """A JPEG with an EXIF tag from 1 to 8, as of a camera that was turned: 3 is upside down, 6 on its side."""
+    jpeg = cv2.imencode(".jpg", COLOURED)[1].tobytes()
+    exif = b"Exif\0\0MM\0*\0\0\0\x08" + struct.pack(">HHHIHHI", 1, 0x112, 3, 1, orientation, 0, 0)
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
 
 
 def images(folder, sizes):

@@ -31,7 +31,7 @@ from cotarget.report.analysis import (
     with_more_placements,
 )
 from cotarget.report.page import write_report
-from cotarget.report.text import advice, correlations, digits, judge, percent, value_and_sigma
+from cotarget.report.text import advice, digits, judge, percent, value_and_sigma
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, SIZES, Lens, Stop, Truth
 from experiments.calibration.synthetic.views import Placing, synthetic_views
@@ -382,7 +382,6 @@ def test_lens_curves_have_the_uncertainty_of_the_zoom_samples(stops):
         grown = (nominal / stops.zoom_head.lens.nominal_px[0]) ** 2
         assert curves.sigmas["kappa1"][where] == pytest.approx(sigma(f"zoom[{i}].k1") / grown, rel=1e-4)
     assert curves.sigmas["pupil_mm"][-1] == pytest.approx(1000 * stops.covariance.sigma("zoom[1].pupil"), rel=1e-4)
-    assert correlations(stops)
 
 
 def test_number_formatting():
