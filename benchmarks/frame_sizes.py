@@ -10,7 +10,6 @@ import ctypes
 import gc
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.pipeline_speed import STAGES, Pipeline
+from benchmarks.pipeline_speed import MIXTURE, STAGES, Pipeline, mixture
 from cotarget.geometry import Array
 from cotarget.rig import Frame
 from experiments.engine import Count, Row, Settings
@@ -29,7 +28,6 @@ RATE_HZ = 25.0
 NOISE = 2.0  # grey levels
 TWIGS = 10
 BIRD_PX, BIRD_CONTRAST = 4, 20
-MIXTURE = "MOG2 alone"
 # Goals: largest ratio to the subtraction alone at each width, part of the frames with the bird, and memory [MB].
 MOST_RATIO = {640: 2.0, 1920: 0.6, 3840: 0.35}
 LEAST_FOUND, MOST_MB = 0.9, 300.0
@@ -84,16 +82,9 @@ def one(settings: FrameSizesSettings, seed: int) -> list[Row]:
 
 
 def _timed(settings: FrameSizesSettings, seed: int, size: tuple[int, int]) -> list[Row]:
-    subtractor = cv2.createBackgroundSubtractorMOG2()
     pipeline = Pipeline(settings.detector, size, RATE_HZ)
-
-    def alone(frame: Frame) -> Row:
-        began = time.perf_counter()
-        subtractor.apply(frame.image)
-        return {"ms": 1e3 * (time.perf_counter() - began)}
-
     rows: list[Row] = []
-    ways: list[tuple[str, Callable[[Frame], Row]]] = [(MIXTURE, alone), (settings.detector, pipeline)]
+    ways: list[tuple[str, Callable[[Frame], Row]]] = [(MIXTURE, mixture()), (settings.detector, pipeline)]
     for index, (frame, bird) in enumerate(film(size, settings.frames, seed)):
         for way, work in ways if index % 2 else reversed(ways):
             done = work(frame)

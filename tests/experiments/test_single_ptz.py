@@ -12,9 +12,9 @@ from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.rig import Frame
 from cotarget.sim.truth import Outlines
 from cotarget.sim.world import SimWorld
-from experiments.following import single_ptz, single_runs
+from experiments.following import single_ptz
 from experiments.following.lone_camera import COAST_S, SEARCH_S, Course, LoneCamera, Sighting, scan_of
-from experiments.following.single_runs import Shaken
+from experiments.following.single_ptz import Shaken
 
 BOOK = DEFAULT_TARGETS["book"]
 STEP = 0.04
@@ -47,13 +47,13 @@ def test_a_clipped_sighting_gives_no_size():
 
 @pytest.fixture
 def world():
-    with (w := SimWorld(single_runs.config_of("book", 0), rendered=())).rig:
+    with (w := SimWorld(single_ptz.config_of("book", 0), rendered=())).rig:
         yield w
 
 
 @pytest.mark.parametrize("size", [(640, 480), (1280, 960), (320, 240)])
 def test_a_scan_sees_all_that_the_wide_camera_does(size):
-    config = single_runs.config_of("book", 0)
+    config = single_ptz.config_of("book", 0)
     scale = size[0] / config.sim.fixed.size[0]
     focal_px = tuple(scale * focal for focal in config.sim.fixed.focal_px)
     fixed = replace(config.sim.fixed, size=size, focal_px=focal_px, center_px=tuple((side - 1) / 2 for side in size))
@@ -76,7 +76,7 @@ def test_a_run_without_a_start_does_not_change_the_other_figures():
     """A person is not wholly in view yet after the least time that can be asked for."""
     rows = [
         {"seed": seed, "target": "person", "way": "pair"} | single_ptz.figures(judged, "pair")
-        for seed, judged in enumerate([single_runs.held("pair", "person", 0, 2.1, 0.05), []])
+        for seed, judged in enumerate([single_ptz.held("pair", "person", 0, 2.1, 0.05), []])
     ]
     assert all(row[key] in (None, 0.0, 1.0) for row in rows for key in single_ptz.FIGURES)
     well = dict(rows[0], closeup_yield=0.6, in_frame_of_all=0.7, watched=0.1)
@@ -129,7 +129,7 @@ def test_after_losing_its_target_the_camera_zooms_out_searches_and_scans(world):
 
 
 def held(way, name, seconds=5.0, miss=0.05):
-    return single_ptz.figures(single_runs.held(way, name, 1, seconds, miss), way)
+    return single_ptz.figures(single_ptz.held(way, name, 1, seconds, miss), way)
 
 
 def test_a_lone_camera_finds_and_holds_a_book():
