@@ -6,10 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cotarget.cli.following import POLICIES, Selection, add_selection
-from cotarget.control import selection as selectors
+from cotarget.cli.following import Selection, add_selection
 from cotarget.control.selection import Candidate
-from cotarget.errors import ConfigError
 from cotarget.rig import PanTiltLimits
 from cotarget.tracking.track import Track
 
@@ -26,11 +24,6 @@ def chosen(*arguments, recorded=None):
 def track(number, center=(1, 1), confirmed=True):
     center, size = np.array(center, float), np.array([20.0, 30.0])
     return Track(number, 0.0, confirmed, 0, center, np.zeros(2), size, 30.0, np.eye(4), 1.0, None)
-
-
-def test_policy_names_are_those_of_the_selectors():
-    assert set(POLICIES) == set(selectors.POLICIES)
-    assert POLICIES[0] == "first-come"
 
 
 @pytest.mark.parametrize(("arguments", "recorded", "number"), [
@@ -76,9 +69,3 @@ def test_unmatched_selection_is_reported_with_the_tracks_seen(arguments, recorde
         assert selection.warning.endswith(": 2")
         selection.see(SimpleNamespace(target=track(4), tracks=[]))
     assert selection.warning == ""
-
-
-@pytest.mark.parametrize("recorded", [{"click": [640.0, 3.0]}, {"policy": "by-name"}])
-def test_invalid_recorded_selection_is_named_as_recorded(recorded):
-    with pytest.raises(ConfigError, match=f"^the recorded {next(iter(recorded))}"):
-        chosen(recorded=recorded)
