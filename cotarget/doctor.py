@@ -164,7 +164,9 @@ def _named(config: "RigConfig", rig: Path) -> list[Finding]:
     if config.recording is not None:
         files["recording"] = config.recording / META
     wrong = {where: f"{path}: no such file" for where, path in files.items() if not path.is_file()}
-    wrong |= {f"targets.{name}": size_implausibility(target, name) for name, target in config.targets.items()}
+    for name, target in config.targets.items():
+        where = f"targets.{name}.size"
+        wrong[where] = size_implausibility(target, name).removeprefix(f"{where}: ")
     return [Finding(where, False, text, f"correct it in {rig}") for where, text in wrong.items() if text]
 
 

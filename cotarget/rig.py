@@ -139,10 +139,11 @@ def refuse_outside(state: PanTiltState, limits: PanTiltLimits, axes: Sequence[st
     for axis in axes:
         angle, (low, high) = getattr(state, axis), getattr(limits, axis)
         if not low - limits.tolerance <= angle <= high + limits.tolerance:
+            inside = math.degrees(min(max(angle, low), high))
             raise DeviceError(
                 f"the head stands at {axis} {math.degrees(angle):.1f} degrees, beyond the limits of "
                 f"{math.degrees(low):.1f} to {math.degrees(high):.1f}, and would move inside; if it may, do so first "
-                f"by cotarget point --{axis}-deg"
+                f"by cotarget point --{axis}-deg {inside:.1f}"
             )
 
 

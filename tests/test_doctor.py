@@ -87,7 +87,7 @@ def findings(config):
     ({"backend": "replay", "recording": "film"}, "recording", "film/recording.json: no such file"),
     ({"targets": {"book": {"template": "cover.png"}}}, "targets.book.template", "cover.png: no such file"),
     ({"sim": {"models": {"duck": "duck.obj"}}}, "sim.models.duck", "duck.obj: no such file"),
-    ({"targets": {"bird": {"size": 80}}}, "targets.bird", "targets.bird.size: 80 m is far from the 0.8 m"),
+    ({"targets": {"bird": {"size": 80}}}, "targets.bird.size", "80 m is far from the 0.8 m"),
 ])  # fmt: skip
 def test_what_a_rig_names_is_looked_for(tried, table, name, said):
     assert name not in findings(parse_config({}))
