@@ -174,7 +174,8 @@ def test_a_write_that_was_suspended_does_not_lose_the_line_but_one_that_is_stuck
 
     if stuck:
         with pytest.raises(LostError):
-            line.write(10_000_000 * b"x")
+            for _ in range(20):  # a machine under load may not have filled the line's buffer in the first
+                line.write(10_000_000 * b"x")
     else:
         port.write = late
         line.write(b"PP ")
