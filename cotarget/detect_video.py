@@ -16,7 +16,7 @@ from cotarget.config import TargetProfile
 from cotarget.detection import make_detector
 from cotarget.drawing import BOX_MARGIN_PX, draw_box, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
-from cotarget.files import CsvFile, check_writable
+from cotarget.files import CsvFile
 from cotarget.geometry import Array
 from cotarget.parallel import Progress
 from cotarget.pipeline import CameraRun
@@ -248,8 +248,6 @@ def run_on_folder(
         CotargetError: a film or its labels cannot be read, or a file cannot be written.
     """
     results, scores, tiles, minutes = {}, [], [], 0.0
-    if sheet is not None:
-        check_writable(sheet)
     labels = [labels_of_film(*pair) for pair in films]  # an error before the long work, not after it
     for i, ((film, _), boxes) in enumerate(zip(films, labels, strict=True)):
         progress(i, len(films), film.stem)

@@ -1,22 +1,21 @@
-"""Write files atomically: a file gets its name only when it is complete, and one run at a time writes it.
+"""Write files atomically: a file gets its name only when it is complete.
 
-`PartFile` locks and replaces a file, `CsvFile` writes tables, and `read_table` reads them. `assets_dir` finds the files
+`PartFile` replaces a file, `CsvFile` writes tables, and `read_table` reads them. `assets_dir` finds the files
 that are installed with cotarget.
 """
 
 import contextlib
 import csv
-import fcntl
 import io
 import os
+import secrets
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cotarget.errors import ConfigError, CotargetError
-from cotarget.safety.signals import DeferredSignals
+from cotarget.safety.signals import deferred_signals
 
 
 def assets_dir() -> Path:
@@ -26,70 +25,38 @@ def assets_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "sim_assets"
 
 
-PATIENCE_S = 5.0  # longest wait for another run that is writing a small file [s]
-RETRY_S = 0.01  # interval of the attempts to lock it [s]
-
-
 def behind_link(path: Path) -> Path:
     """Resolve a symbolic link to its target, which may not exist yet; return other paths unchanged."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 class PartFile:
-    """Temporary file beside a result, which gets the result's name in one step.
-
-    It has the same name in every run and is locked until its run ends: a second run on the same result waits or is
-    refused, and the file of a killed run is reused.
+    """Temporary file beside a result, which replaces the result in one step; a killed run leaves it.
 
     Attributes:
-        path: the temporary file to write to.
+        path: path of the temporary file, which no other run has; if the result is a link, it is beside the link's
+            target.
+        file: the temporary file, open for writing.
     """
 
-    def __init__(self, path: Path, patience_s: float = 0.0) -> None:
-        """Lock the file, which may be that of a killed run.
-
-        Args:
-            path: the result; if it is a link, the link's target is replaced in the end.
-            patience_s: how long to wait for another run that is writing it [s].
+    def __init__(self, path: Path) -> None:
+        """Open the temporary file of a result.
 
         Raises:
-            ConfigError: another run is still writing it, or it cannot be written.
+            ConfigError: it cannot be written.
         """
         self._name, self._final = path, behind_link(path)
-        self.path = self._final.with_name(f".{self._final.stem}.part{self._final.suffix}")
+        self.path = self._final.with_name(f".{self._final.stem}.{secrets.token_hex(3)}.part{self._final.suffix}")
         try:
-            self._lock = self._take(time.monotonic() + patience_s)
-        except BlockingIOError:
-            raise ConfigError(f"{path}: is being written by another run; give another name, or wait for it") from None
+            self.file = self.path.open("xb", buffering=0)
         except OSError as error:
-            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
-
-    def _take(self, until: float) -> int:
-        """Open and lock the file, but never one that was just renamed or removed by another run."""
-        while True:
-            lock = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-            try:
-                with contextlib.suppress(FileNotFoundError):
-                    _lock(lock)
-                    if os.path.samestat(os.fstat(lock), self.path.stat()):
-                        return lock
-            except BlockingIOError:
-                os.close(lock)
-                if time.monotonic() >= until:
-                    raise
-                time.sleep(RETRY_S)
-                continue
-            except BaseException:
-                os.close(lock)
-                raise
-            os.close(lock)
+            raise write_error(path, error) from None
 
     @contextlib.contextmanager
     def ending(self, *, keep: bool, error: BaseException | None = None) -> Iterator[None]:
-        """Complete and close the file in this block; after it the file has its name, or is removed.
+        """Complete the file in this block; after it the file is closed, and has its name or is removed.
 
-        Signals are deferred meanwhile, so that a second Ctrl-C loses nothing. They are delivered afterwards, unless the
-        run has ended in an error already.
+        Signals are deferred, because a second Ctrl-C while a film is completed would lose the film of a whole run.
 
         Args:
             keep: whether the file gets its name.
@@ -99,54 +66,21 @@ class PartFile:
             CotargetError: the file could not be completed, for example on a full disk; after an error it only gets a
                 note.
         """
-        kept, deferred = False, DeferredSignals()
-        deferred.let_hurry()
         try:
-            deferred.defer()
-            yield
-            if keep:
-                self.path.replace(self._final)
-                kept = True
-                if error is not None:
-                    error.add_note(f"{self._name} holds what there was until then")
+            with deferred_signals(deliver=error is None):
+                with self.file:
+                    yield
+                if keep:
+                    self.path.replace(self._final)
+                    if error is not None:
+                        error.add_note(f"{self._name} holds what there was until then")
         except (OSError, CotargetError) as failure:
             if error is None:
                 raise write_error(self._name, failure) from None
             if keep:
                 error.add_note(f"{self._name} could not be completed")
         finally:
-            if not kept:
-                self.path.unlink(missing_ok=True)
-            with contextlib.suppress(OSError):
-                fcntl.flock(self._lock, fcntl.LOCK_UN)  # a child process may hold the descriptor too
-            os.close(self._lock)
-            deferred.restore()
-        if error is None:
-            deferred.deliver()
-
-
-def check_writable(path: Path) -> None:
-    """Refuse a result that cannot be written, before the work starts.
-
-    Raises:
-        ConfigError: another run is writing it, or its folder is not writable.
-    """
-    with PartFile(path).ending(keep=False):
-        pass
-
-
-def _lock(descriptor: int) -> None:
-    """Lock a file, if its file system supports locks.
-
-    Raises:
-        BlockingIOError: another process has locked it.
-    """
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise
-    except OSError:
-        pass
+            self.path.unlink(missing_ok=True)
 
 
 def write_error(path: Path, failure: OSError | CotargetError) -> CotargetError:
@@ -160,13 +94,12 @@ def write_atomically(path: Path, data: bytes) -> None:
     """Replace a file's content in one step, even if the program or the power fails halfway.
 
     Raises:
-        ConfigError: the file cannot be written, or another run keeps writing it.
+        ConfigError: the file cannot be written.
     """
-    part = PartFile(path, PATIENCE_S)
-    with part.ending(keep=True), part.path.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    part = PartFile(path)
+    with part.ending(keep=True):
+        write_all(part.file, data)
+        os.fsync(part.file.fileno())
 
 
 STDOUT = Path("-")  # name of stdout as the file of a table
@@ -192,7 +125,6 @@ class CsvFile(contextlib.AbstractContextManager["CsvFile", None]):
         """
         self._path, self._keep, self._rows = path, keep, 0
         self._part = None if path == STDOUT else PartFile(path)
-        self._file = None if self._part is None else self._part.path.open("wb", buffering=0)
         self._line = io.StringIO(newline="")
         self._writer = csv.writer(self._line, lineterminator=line_end)
         try:
@@ -215,15 +147,15 @@ class CsvFile(contextlib.AbstractContextManager["CsvFile", None]):
         line = self._line.getvalue()
         self._line.seek(0)
         self._line.truncate()
-        if self._file is None:
+        if self._part is None:
             sys.stdout.write(line)
             sys.stdout.flush()
             return
-        begin = self._file.tell()
+        begin = self._part.file.tell()
         try:
-            write_all(self._file, line.encode())
+            write_all(self._part.file, line.encode())
         except OSError as error:
-            self._file.truncate(begin)
+            self._part.file.truncate(begin)
             raise write_error(self._path, error) from None
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
@@ -232,10 +164,9 @@ class CsvFile(contextlib.AbstractContextManager["CsvFile", None]):
         Raises:
             ConfigError: the file could not be completed.
         """
-        if self._part is None or self._file is None:
-            return
-        with self._part.ending(keep=error is None or (self._keep and self._rows > 0), error=error):
-            self._file.close()
+        if self._part is not None:
+            with self._part.ending(keep=error is None or (self._keep and self._rows > 0), error=error):
+                pass
 
 
 def write_all(file: io.RawIOBase, data: bytes) -> None:

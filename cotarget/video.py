@@ -19,7 +19,7 @@ import numpy as np
 from cotarget.errors import CotargetError
 from cotarget.files import PartFile, write_all
 from cotarget.rig import Frame, Image
-from cotarget.safety.signals import DeferredSignals
+from cotarget.safety.signals import deferred_signals
 
 log = logging.getLogger(__name__)
 
@@ -342,12 +342,12 @@ class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
             keep: whether to keep the frames so far as a film if the block ends in an error.
 
         Raises:
-            CotargetError: the folder is missing, the suffix names no container, or another run is writing the film.
+            CotargetError: the folder is missing, or the suffix names no container.
         """
         self._path, self._keep = path, keep
         self.epoch: datetime | None = None
         self._part = PartFile(path)
-        self._file = _FilmFile(self._part.path)
+        self._file = _FilmFile(self._part)
         self._rate = Fraction(rate_hz).limit_denominator(1001 * 30)
         self._stream: av.VideoStream | None = None
         self._begin, self._last = 0.0, -TICKS_HZ
@@ -355,7 +355,7 @@ class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
             options = FRAGMENTS if path.suffix.lower() in FRAGMENTED else {}
             self._container = av.open(self._file, "w", options=options)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            with self._part.ending(keep=False), contextlib.closing(self._file):
+            with self._part.ending(keep=False):
                 raise self._said(error) from None
 
     def write(self, image: Image, t: float) -> None:
@@ -371,23 +371,19 @@ class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
         height, width = image.shape[:2]
         if height % 2 or width % 2:
             image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE).astype(np.uint8)
-        deferred = DeferredSignals()  # an exception while the file is written would be lost in FFmpeg
-        deferred.defer()
         try:
-            if self._stream is None:
-                self._stream, self._begin = self._begun(image, t), t
-            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
-            tick = self._stream.codec_context.time_base
-            assert tick is not None
-            least = max(1, round(LEAST_S / tick))
-            self._last = max(self._last + least, round((t - self._begin) / tick))  # a clock may jump back
-            picture.pts, picture.time_base, picture.duration = self._last, tick, round(1 / self._rate / tick)
-            self._container.mux(self._stream.encode(picture))
+            with deferred_signals():  # an exception while the file is written would be lost in FFmpeg
+                if self._stream is None:
+                    self._stream, self._begin = self._begun(image, t), t
+                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
+                tick = self._stream.codec_context.time_base
+                assert tick is not None
+                least = max(1, round(LEAST_S / tick))
+                self._last = max(self._last + least, round((t - self._begin) / tick))  # a clock may jump back
+                picture.pts, picture.time_base, picture.duration = self._last, tick, round(1 / self._rate / tick)
+                self._container.mux(self._stream.encode(picture))
         except (av.error.FFmpegError, ValueError) as error:
             self._file.refuse(error)
-        finally:
-            deferred.restore()
-        deferred.deliver()
         if self._file.failure is not None:
             raise self._said(self._file.failure)
 
@@ -451,10 +447,10 @@ class _FilmFile:
         failure: the first error; None if there was none.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.name = str(path)
+    def __init__(self, part: PartFile) -> None:
+        self.name = str(part.path)
         self.failure: Exception | None = None
-        self._file = path.open("wb", buffering=0)
+        self._file = part.file
         self._at = self._size = 0
         self._overwritten: list[tuple[int, bytes]] = []
 

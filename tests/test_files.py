@@ -1,11 +1,9 @@
-"""Files get their name when they are complete, and are written by one run at a time, through links."""
+"""Files get their name when they are complete, and are written through links."""
 
-import fcntl
 import re
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import av
@@ -137,45 +135,14 @@ def test_film_on_a_filling_disk_can_be_played_up_to_there(tmp_path, suffix):
     assert names(tmp_path) == sorted([f"a{suffix}", f"whole{suffix}"])
 
 
-@pytest.mark.parametrize(("name", "make"), [
-    ("a.csv", lambda path: CsvFile(path, ("n",))),
-    ("a.mp4", lambda path: FilmWriter(path, 25.0)),
-])  # fmt: skip
-def test_second_run_on_the_same_result_is_refused(tmp_path, name, make):
-    path = tmp_path / name
-    (tmp_path / "link").symlink_to(path)
-    with make(path):
-        for other in (path, tmp_path / "link"):
-            with pytest.raises(ConfigError, match="is being written by another run") as caught:
-                make(other)
-            assert str(other) in str(caught.value)
-    with make(path):  # and not after that
-        pass
-
-
-def test_small_file_waits_for_another_run(tmp_path):
-    """The second file is complete afterwards."""
-    path = tmp_path / "a.json"
-    first = PartFile(path)
-    first.path.write_text("first")
-
-    def end():
-        with first.ending(keep=True):
-            pass
-
-    timer = threading.Timer(0.1, end)
-    timer.start()
-    write_atomically(path, b"second")
-    timer.join()
-    assert path.read_text() == "second"
-    assert names(tmp_path) == ["a.json"]
-
-
-def test_wait_for_another_run_ends_in_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr("cotarget.files.PATIENCE_S", 0.05)
-    with CsvFile(tmp_path / "a.csv", ("n",)), pytest.raises(ConfigError, match="is being written by another run"):
-        write_atomically(tmp_path / "a.csv", b"whole")
-    assert (tmp_path / "a.csv").read_text().split() == ["n"]
+def test_two_runs_on_one_result_leave_the_whole_file_of_the_later(tmp_path):
+    path = tmp_path / "a.csv"
+    with CsvFile(path, ("n",)) as first:
+        first.write([1])
+        write_table(path, 3)
+        assert path.read_text().split() == ["n", "0", "1", "2"]
+    assert path.read_text().split() == ["n", "1"]
+    assert names(tmp_path) == ["a.csv"]
 
 
 class Signalled:
@@ -247,7 +214,7 @@ def complete(part, signals):
     with part.ending(keep=True):
         for _ in range(signals):
             signal.raise_signal(signal.SIGINT)
-        part.path.write_text("whole")
+        part.file.write(b"whole")
 
 
 KILLED = """
@@ -264,41 +231,12 @@ os.kill(os.getpid(), 9)
 """
 
 
-def test_part_file_of_a_killed_run_is_readable_and_reused(tmp_path):
-    path = tmp_path / "a.csv"
+def test_part_file_of_a_killed_run_is_readable(tmp_path):
     subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, check=False)
-    assert names(tmp_path) == [".a.part.csv", ".a.part.mp4"]
-    assert (tmp_path / ".a.part.csv").read_text().split() == ["n", *map(str, range(150))]
-    assert len(times_in(tmp_path / ".a.part.mp4")) >= 50
-    (tmp_path / ".a.part.mp4").unlink()
-    write_table(path, 1)
-    assert names(tmp_path) == ["a.csv"]
-    assert path.read_text().split() == ["n", "0"]
-
-
-def test_renamed_part_file_is_not_locked_again(tmp_path, monkeypatch):
-    """A second run opens the part file of the first, which is renamed before it can be locked."""
-    path = tmp_path / "a.csv"
-    first, opened = PartFile(path), []
-    first.path.write_text("first")
-
-    def flock(descriptor, operation, plain=fcntl.flock):
-        if not opened:
-            opened.append(descriptor)
-            with first.ending(keep=True):
-                pass
-        plain(descriptor, operation)
-
-    monkeypatch.setattr(fcntl, "flock", flock)
-    second = PartFile(path)
-    with pytest.raises(ConfigError, match="another run"):
-        PartFile(path)
-    second.path.write_text("second")
-    assert path.read_text() == "first"
-    with second.ending(keep=True):
-        pass
-    assert path.read_text() == "second"
-    assert names(tmp_path) == ["a.csv"]
+    [table], [film] = tmp_path.glob(".a.*.part.csv"), tmp_path.glob(".a.*.part.mp4")
+    assert table.read_text().split() == ["n", *map(str, range(150))]
+    assert len(times_in(film)) >= 50
+    assert len(names(tmp_path)) == 2
 
 
 @pytest.mark.parametrize("exists", [True, False])

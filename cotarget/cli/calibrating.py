@@ -20,7 +20,7 @@ from cotarget.cli.common import (
     rig_files,
 )
 from cotarget.errors import CalibrationError, ConfigError
-from cotarget.files import behind_link, check_writable
+from cotarget.files import behind_link
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
@@ -46,7 +46,6 @@ def calibrate_command(options: argparse.Namespace) -> None:
     if config is not None and config.backend == "replay":
         raise ConfigError(f"{options.rig}: backend is 'replay'; calibrate from the captures of a session: --from DIR")
     _check_together(options)
-    check_writable(options.out)
     how = cal.Options(options.method, encoders=options.encoders, regularize=options.insist)
     with _captures_kept(options.captures), progress_bar() as bar:
 

@@ -209,49 +209,20 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None],
         inputs: files that are read, and folders whose contents must not change.
         folder: new folder to write, which may not contain any output.
     """
-    taken = {_real(path) for path in inputs if path is not None}
-    if folder is not None:
-        _refuse_taken(folder, taken)
-        taken.add(_real(folder))
-    for path in outputs:
+    taken = [os.path.realpath(path) for path in inputs if path is not None]
+    for path in (folder, *outputs):
         if path is None:
             continue
-        if path == STDOUT:
-            raise ConfigError("-: stdout takes the table of --csv alone; name a file")
-        if path.is_dir():
-            raise ConfigError(f"{path}: is a folder; name the file to write")
-        if path.exists() and not path.is_file():
-            raise ConfigError(f"{path}: is a device or a pipe, not a file; name the file to write")
-        if _is_stdout_or_stderr(path):
-            raise ConfigError(f"{path}: is this command's own stdout or stderr; name another file to write")
-        if (goal := behind_link(path)).is_symlink():
-            raise ConfigError(f"{path}: is a link to itself; name the file to write")
-        if goal.parent.exists() and not goal.parent.is_dir():
-            raise ConfigError(f"{path}: {goal.parent} is a file, not a folder; name a file in a folder")
-        if not goal.absolute().parent.is_dir():
-            raise ConfigError(f"{path}: its folder does not exist; create it first")
-        _refuse_taken(path, taken)
-        taken.add(_real(path))
-
-
-def _real(path: Path) -> Path:
-    return Path(os.path.realpath(path))
-
-
-def _refuse_taken(path: Path, taken: Iterable[Path]) -> None:
-    """Refuse a path that is one of these files, or is inside one of these folders."""
-    for each in taken:
-        if _real(path) == each:
-            raise ConfigError(f"{path}: is read or written for something else too; give another name for the result")
-        if _real(path).is_relative_to(each):
-            raise ConfigError(f"{path}: is in {each}, which is read or written as a whole; name a file outside of it")
-
-
-def _is_stdout_or_stderr(path: Path) -> bool:
-    with contextlib.suppress(OSError):
-        file = path.stat()
-        return any(os.path.samestat(file, os.fstat(stream)) for stream in (1, 2))
-    return False
+        goal = Path(os.path.realpath(path))
+        if any(goal.is_relative_to(each) for each in taken):
+            raise ConfigError(f"{path}: is read or written for something else too, or its folder is; give another name")
+        taken.append(str(goal))
+        if path is folder:
+            continue
+        if goal.exists() and not goal.is_file():
+            raise ConfigError(f"{path}: is no file, which would be replaced; name the file to write")
+        if not goal.parent.is_dir() or not os.access(goal.parent, os.W_OK):
+            raise ConfigError(f"{path}: its folder does not exist, or cannot be written to")
 
 
 @contextmanager

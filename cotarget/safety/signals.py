@@ -209,10 +209,11 @@ class DeferredSignals:
 
 
 @contextlib.contextmanager
-def deferred_signals() -> Iterator[None]:
+def deferred_signals(*, deliver: bool = True) -> Iterator[None]:
     """Defer SIGINT, SIGTERM and other ending signals in this block, and deliver the first one after it.
 
-    `IMPATIENCE` signals end the block, if for example a pipe takes no more data.
+    `IMPATIENCE` signals end the block, if for example a pipe takes no more data. ``deliver`` is false where an error
+    ends the program anyhow.
     """
     deferred = DeferredSignals()
     deferred.let_hurry()
@@ -221,4 +222,5 @@ def deferred_signals() -> Iterator[None]:
         yield
     finally:
         deferred.restore()
-    deferred.deliver()
+    if deliver:
+        deferred.deliver()

@@ -69,7 +69,6 @@ CALLS = [
     ("calibrate --rig folder", FAILED, "folder"),
     ("calibrate --rig moon.toml", FAILED, "moon.toml: ", "'moon'", "indoor, outdoor"),
     ("calibrate --rig nameless.toml", FAILED, "nameless.toml: hardware.head.port"),
-    ("calibrate --rig rig.toml --out -", FAILED, "-: "),
     ("calibrate --rig rig.toml --out folder", FAILED, "folder: "),
     ("calibrate --rig replay.toml --out new.json", FAILED, "replay.toml: backend is 'replay'"),
     ("calibrate --rig rig.toml --board 9x6", FAILED, "--board", "--from"),
@@ -97,7 +96,7 @@ CALLS = [
     # report and board
     ("report list.json", FAILED, "list.json"),
     ("report millimetres.json --out page.html", FAILED, POSE, "metres", "--insist"),
-    ("report good.json --out film.mp4/page.html", FAILED, "film.mp4/page.html: film.mp4"),
+    ("report good.json --out film.mp4/page.html", FAILED, "film.mp4/page.html: "),
     ("board --out new.txt", FAILED, "new.txt", ".pdf, .png, .svg"),
     ("board --out new.pdf --square 25", FAILED, "--square", "0.025"),
     # aim
