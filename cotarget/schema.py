@@ -2,8 +2,8 @@
 
 `model` makes a frozen dataclass whose fields are strict: a bool or "12" is no number, an int may be a float, and an
 unknown key is refused. Ranges are metadata of a field's type: those of annotated_types, and `OneOf`, `Check` and a text
-such as "[lowest, highest]", which messages show. A check across keys is a `__post_init__` that raises a ValueError
-beginning with the key and a colon.
+such as "[lowest, highest]", which docs/configuration.md shows. A check across keys is a `__post_init__` that raises a
+ValueError beginning with the key and a colon.
 
 pydantic is imported at the first `validate`, because commands such as `cotarget stop` must be quick.
 """
@@ -13,7 +13,7 @@ import functools
 import json
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, dataclass_transform
@@ -238,57 +238,22 @@ def _required(cls: type[Any]) -> list[str]:
 
 # Messages
 
-NO_TABLE = ("dataclass_type", "dict_type", "mapping_type")
-UNKNOWN, MISSING = "unexpected_keyword_argument", "missing"
-RANGES = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
+UNKNOWN = "unexpected_keyword_argument"
 
 
 def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str]) -> str:
     """Say in one line what is wrong; an unknown key comes first, because a misspelt one makes others missing."""
     error = min(errors, key=lambda each: each["type"] != UNKNOWN)
-    kind, loc, value = error["type"], error["loc"], error["input"]
-    if kind == "json_invalid":  # half of a surrogate pair in a text, or tables nested too deeply
-        return f"{where or 'the file'}: {error['msg']}"
-    for end in range(len(loc)):  # below a union, pydantic's location continues with the type that it tried
-        if _is_union(_hint_at(cls, loc[:end])):
-            tried = (each for each in errors if each["loc"][:end] == loc[:end])
-            return f"{_join(where, loc[:end])}: {'; '.join(dict.fromkeys(map(_words, tried)))}"
-    outer, hint = _table_at(cls, loc[:-1]), None if kind == UNKNOWN else _hint_at(cls, loc)
-    at, above = _join(where, loc), _join(where, loc[:-1])
-    if kind == UNKNOWN:
-        names = [field.name for field in dataclasses.fields(outer)]
-        return f"unknown key '{at}'; valid here: {choices([*names, *(beside if len(loc) == 1 else ())])}"
-    if kind == MISSING and not isinstance(loc[-1], int):
-        first = min(each["loc"][-1] for each in errors if each["type"] == MISSING and each["loc"][:-1] == loc[:-1])
-        return f"{above and f'{above}: '}missing key '{first}'; needed here: {choices(_required(outer))}"
-    if kind in (MISSING, "too_long", "too_short"):  # of a list
-        here, listed = (above, loc[:-1]) if kind == MISSING else (at, loc)
-        of_list = _hint_at(cls, listed)
-        return f"{here}: has {len(value)} values where {len(typing.get_args(bare(of_list)))} are wanted{_form(of_list)}"
-    if kind in NO_TABLE:
-        return f"{at}: {value!r} is not a table"
-    if kind == "literal_error":
-        return f"{at}: {value!r} is not one of: {choices(map(str, typing.get_args(bare(hint))))}"
-    if kind == "value_error":
-        reason = str(error["ctx"]["error"])
-        is_table = dataclasses.is_dataclass(bare(hint)) or bare(hint) is RigidTransform
+    loc, value = error["loc"], error["input"]
+    table, known = _known(cls, loc)
+    if error["type"] == UNKNOWN and known == len(loc) - 1:
+        names = choices([*(field.name for field in dataclasses.fields(table)), *(() if known else beside)])
+        return f"unknown key '{_join(where, loc)}'; valid here: {names}"
+    at = _join(where, loc[:known])
+    if error["type"] == "value_error":
+        reason, is_table = str(error["ctx"]["error"]), dataclasses.is_dataclass(table) or table is RigidTransform
         return _join(at, (reason,)) if is_table else f"{at}: {reason}"
-    while kind in RANGES and at.endswith("]"):  # the range is the list's
-        at = at[: at.rindex("[")]
-    return f"{at}: {_words(error)}{_form(hint) if kind == 'tuple_type' else ''}"
-
-
-def _words(error: Any) -> str:
-    """Say what is wrong with a value in pydantic's words; a list is its array."""
-    return str(error["msg"]).replace("Input", repr(error["input"]), 1).replace("valid array", "list")
-
-
-def _is_union(hint: Any) -> bool:
-    """Whether an annotation is a union of several types, beside None."""
-    if typing.get_origin(hint) is Annotated:
-        hint = typing.get_args(hint)[0]
-    kinds = [each for each in typing.get_args(hint) if each is not types.NoneType]
-    return typing.get_origin(hint) in (types.UnionType, typing.Union) and len(kinds) > 1
+    return f"{at or 'the file'}: {error['msg'].replace('Input', repr(value), 1)}"
 
 
 def _join(where: str, loc: Iterable[str | int]) -> str:
@@ -298,24 +263,22 @@ def _join(where: str, loc: Iterable[str | int]) -> str:
     return where
 
 
-def _hint_at(hint: Any, loc: Iterable[str | int]) -> Any:
-    """Find the annotation of a place in a table."""
-    for part in loc:
-        outer = _table_at(hint, ())
-        if dataclasses.is_dataclass(outer):
-            hint = typing.get_type_hints(outer, include_extras=True)[str(part)]
-        elif isinstance(part, int):
-            args = typing.get_args(outer)
-            hint = args[0] if args[-1] is ... or len(args) == 1 else args[part]
+def _known(hint: Any, loc: Sequence[str | int]) -> tuple[Any, int]:
+    """Find the type of a place in a table, and how many parts of the place are known.
+
+    Below a union, pydantic's place continues with the type that it tried.
+    """
+    for n, part in enumerate(loc):
+        table = _PoseTable if bare(hint) is RigidTransform else bare(hint)
+        hints = typing.get_type_hints(table, include_extras=True) if dataclasses.is_dataclass(table) else {}
+        inner = typing.get_args(table)
+        if part in hints:
+            hint = hints[part]
+        elif inner and isinstance(part, int) == (typing.get_origin(table) in (tuple, list)):
+            hint = inner[0] if isinstance(part, int) else inner[-1]  # of a Mapping
         else:
-            hint = typing.get_args(outer)[1]  # of a Mapping
-    return hint
-
-
-def _table_at(hint: Any, loc: Iterable[str | int]) -> Any:
-    """Find the type of a place in a table; that of a pose's table for a pose."""
-    found = bare(_hint_at(hint, loc))
-    return _PoseTable if found is RigidTransform else found
+            return table, n
+    return bare(hint), len(loc)
 
 
 def bare(hint: Any) -> Any:
@@ -336,11 +299,3 @@ def _metadata(hint: Any) -> tuple[Any, ...]:
 def form_of(hint: Any) -> str:
     """Return the text in an annotation's metadata, such as "[lowest, highest]"; empty if there is none."""
     return next((each for each in _metadata(hint) if isinstance(each, str)), "")
-
-
-def _form(hint: Any) -> str:
-    """Write how a list must look, for the end of a message."""
-    form, args = form_of(hint), typing.get_args(bare(hint))
-    if not form and args and args[-1] is ... and (one := form_of(args[0])):
-        form = f"[{one}, ...]"
-    return form and f", {form}"

@@ -61,7 +61,7 @@ def test_captures_may_be_in_any_order_beside_unlisted_images(folder):
     ([], {}, "captures: "),
     ([FIXED], {"schema": 2}, "schema 2"),
     ([FIXED], {"board": BOARD | {"kind": "circles"}}, "board.kind"),
-    ([FIXED], {"board": {"kind": "chessboard", "corners": [9, 6]}}, "board: missing key 'square'"),
+    ([FIXED], {"board": {"kind": "chessboard", "corners": [9, 6]}}, "board.square: Field required"),
     ([FIXED, ZOOM | {"file": "c.png"}], {}, "captures[1].file: c.png"),
     ([FIXED, ZOOM, FIXED], {}, "captures[2].file: a.png"),
     ([FIXED, FIXED | {"file": "./a.png"}], {}, "captures[1].file: a.png"),

@@ -439,8 +439,11 @@ def test_rig_toml_names_the_network_beside_it(tmp_path):
     network = config.target("gull").network
     assert network == NetworkConfig(tmp_path / "n.onnx", "yolo", (640, 384), (14,), 0.3, True)
     for wrong, message in (
-        ({"layout": "yolo"}, "targets.gull.network: missing key 'model'"),
-        ({"model": "n.onnx", "layout": "?"}, "targets.gull.network.layout: '?' is not one of: detr, rtdetr, ssd, yolo"),
+        ({"layout": "yolo"}, "targets.gull.network.model: Field required"),
+        (
+            {"model": "n.onnx", "layout": "?"},
+            "targets.gull.network.layout: '?' should be 'yolo', 'yolov5', 'yolov10', 'ssd'",
+        ),
         ({"model": "n.onnx", "classes": [-1]}, "targets.gull.network.classes"),
         ({"model": "n.onnx", "std": [1, 0, 1]}, "targets.gull.network.std"),
         ({"model": "n.onnx", "size": 3}, "unknown key 'targets.gull.network.size'"),
