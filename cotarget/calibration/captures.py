@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from annotated_types import Ge
 
-from cotarget.calibration.file import check_schema, read_object, write_board
+from cotarget.calibration.file import check_schema, read_object
 from cotarget.calibration.model import CameraName, Capture
 from cotarget.config import BoardConfig, RigConfig, WrittenBoard, config_table
 from cotarget.errors import CalibrationError, ConfigError
@@ -141,7 +141,7 @@ def write_index(directory: Path, index: CaptureIndex) -> None:
         for capture in index.captures
     )
     text = (
-        f'{{\n  "schema": {SCHEMA},\n  "board": {json.dumps(write_board(index.board))},\n'
+        f'{{\n  "schema": {SCHEMA},\n  "board": {json.dumps(vars(index.board))},\n'
         f'  "pitch_mm": {json.dumps(index.pitch_mm)},\n  "captures": [\n    {rows}\n  ]\n}}\n'
     )
     write_atomically(directory / INDEX, text.encode())

@@ -9,7 +9,6 @@ starts from exactly the same numbers.
 `CalibrationTable` and its parts describe the keys; `validate` checks them.
 """
 
-import dataclasses
 import itertools
 import json
 import math
@@ -28,7 +27,7 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, WrittenBoard
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.files import write_atomically
-from cotarget.geometry import pose_dict
+from cotarget.geometry import RigidTransform, pose_dict
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.schema import NotNegative, Pose, Positive, Size, model, validate
@@ -118,10 +117,10 @@ class Calibration:
             CalibrationError: the calibration holds a number that is not finite.
         """
         try:
-            text = _readable(_table(self))
-        except ValueError:
-            raise CalibrationError(f"{path}: not written: the calibration holds a number that is not finite") from None
-        write_atomically(Path(path), text.encode())
+            text = json.dumps(_table(self), default=_plain, allow_nan=False)
+        except ValueError as error:
+            raise CalibrationError(f"{path}: not written: {error}") from None
+        write_atomically(Path(path), _readable(json.loads(text)).encode())
 
 
 def read_object(path: Path, wanted: str) -> Table:
@@ -176,43 +175,43 @@ Distortion = Annotated[tuple[Coefficient, Coefficient, Coefficient, Coefficient,
 
 
 @model
-class IntrinsicsTable:
-    """Intrinsics without the image's size."""
+class FixedTable:
+    """The fixed camera."""
 
+    size: Size
     fx: FocalPx
     fy: FocalPx
     cx: float
     cy: float
     distortion: Distortion
 
-    def check_center(self, size: tuple[int, int], where: str = "") -> None:
-        """Refuse a principal point that is far off the image."""
-        far = IMAGES_OFF * max(size)
-        for key in ("cx", "cy"):
-            if not -far <= (value := getattr(self, key)) <= far:
-                raise ValueError(f"{where}{key}: {value:g} is not within {-far:g} to {far:g}")
-
-    def intrinsics(self, size: tuple[int, int]) -> Intrinsics:
-        """Make the intrinsics for an image's size."""
-        return Intrinsics(size, (self.fx, self.fy), (self.cx, self.cy), self.distortion)
-
-
-@model
-class FixedTable(IntrinsicsTable):
-    """The fixed camera."""
-
-    size: Size
-
     def __post_init__(self) -> None:
-        self.check_center(self.size)
+        _check_center(self, self.size)
 
 
 @model
-class StopTable(IntrinsicsTable):
+class StopTable:
     """A zoom sample."""
 
     nominal_px: FocalPx
+    fx: FocalPx
+    fy: FocalPx
+    cx: float
+    cy: float
+    distortion: Distortion
     pupil: float
+
+
+def _check_center(lens: FixedTable | StopTable, size: tuple[int, int], where: str = "") -> None:
+    """Refuse a principal point that is far off the image."""
+    far = IMAGES_OFF * max(size)
+    for key, value in (("cx", lens.cx), ("cy", lens.cy)):
+        if not -far <= value <= far:
+            raise ValueError(f"{where}{key}: {value:g} is not within {-far:g} to {far:g}")
+
+
+def _intrinsics(lens: FixedTable | StopTable, size: tuple[int, int]) -> Intrinsics:
+    return Intrinsics(size, (lens.fx, lens.fy), (lens.cx, lens.cy), lens.distortion)
 
 
 @model
@@ -226,7 +225,7 @@ class ZoomTable:
         if not self.stops:
             raise ValueError("stops: is empty; at least one calibrated focal length is needed")
         for i, stop in enumerate(self.stops):
-            stop.check_center(self.size, f"stops[{i}].")
+            _check_center(stop, self.size, f"stops[{i}].")
         if any(b.nominal_px <= a.nominal_px for a, b in itertools.pairwise(self.stops)):
             raise ValueError("stops: the values of nominal_px do not increase")
         if self.stops[0].pupil != 0:
@@ -236,7 +235,7 @@ class ZoomTable:
         """Make the zoom lens."""
         return ZoomLens(
             tuple(stop.nominal_px for stop in self.stops),
-            tuple(stop.intrinsics(self.size) for stop in self.stops),
+            tuple(_intrinsics(stop, self.size) for stop in self.stops),
             tuple(stop.pupil for stop in self.stops),
         )
 
@@ -255,14 +254,8 @@ class HeadTable:
 
     def geometry(self) -> HeadGeometry:
         """Make the head's geometry."""
-        return HeadGeometry(
-            axis_offset=self.axis_offset,
-            squareness=math.radians(self.squareness_deg),
-            pan_scale=self.pan_scale,
-            tilt_scale=self.tilt_scale,
-            pan_zero=math.radians(self.pan_zero_deg),
-            tilt_zero=math.radians(self.tilt_zero_deg),
-        )
+        squareness, *zeros = map(math.radians, (self.squareness_deg, self.pan_zero_deg, self.tilt_zero_deg))
+        return HeadGeometry(self.axis_offset, squareness, self.pan_scale, self.tilt_scale, *zeros)
 
 
 @model
@@ -299,10 +292,15 @@ class ViewTable:
     source: str | None
     corners_px: tuple[Annotated[tuple[float, float], "[u, v]"] | None, ...]
 
+    @classmethod
+    def of(cls, view: View) -> "ViewTable":
+        """Make the table of a view."""
+        return cls(**vars(view) | {"corners_px": [None if math.isnan(u) else (u, v) for u, v in view.corners_px]})
+
     def view(self) -> View:
         """Make the view."""
         corners_px = np.array([(np.nan, np.nan) if corner is None else corner for corner in self.corners_px])
-        return View(self.camera, corners_px, self.board, self.pan, self.tilt, self.focal_px, self.t, self.source)
+        return View(**vars(self) | {"corners_px": corners_px})
 
 
 @model
@@ -325,8 +323,6 @@ class CalibrationTable:
     views: tuple[ViewTable, ...]
 
     def __post_init__(self) -> None:
-        if self.covariance is not None:
-            check_covariance(self.covariance.covariance(), len(self.zoom.stops))
         if self.board is None:
             if self.views:
                 raise ValueError("board: is null, but there are views of one")
@@ -338,8 +334,10 @@ class CalibrationTable:
 
     def calibration(self) -> Calibration:
         """Make the calibration."""
+        if self.covariance is not None:
+            check_covariance(self.covariance.covariance(), len(self.zoom.stops))
         return Calibration(
-            fixed=FixedCamera(self.fixed.intrinsics(self.fixed.size)),
+            fixed=FixedCamera(_intrinsics(self.fixed, self.fixed.size)),
             zoom_head=ZoomHead(self.zoom.lens(), self.T_zoom0_fixed, self.T_head_zoom, self.head.geometry()),
             jitter=math.radians(self.head.jitter_deg),
             pitch_mm=self.pitch_mm,
@@ -387,46 +385,44 @@ OTHERS = (
 )
 
 
-def _table(calibration: Calibration) -> dict[str, Any]:
-    """Make the JSON object of a calibration."""
-    head, covariance = calibration.zoom_head, calibration.covariance
-    return {
-        "schema": SCHEMA,
-        "fixed": {"size": list(calibration.fixed.size), **_write_intrinsics(calibration.fixed.lens)},
-        "zoom": {
-            "size": list(head.lens.size),
-            "stops": [
-                {"nominal_px": float(nominal), **_write_intrinsics(stop), "pupil": float(pupil)}
-                for nominal, stop, pupil in zip(head.lens.nominal_px, head.lens.stops, head.lens.pupil, strict=True)
-            ],
-        },
-        "T_zoom0_fixed": pose_dict(head.T_zoom0_fixed),
-        "T_head_zoom": None if head.T_head_zoom is None else pose_dict(head.T_head_zoom),
-        "head": {
-            "axis_offset": float(head.axes.axis_offset),
-            "squareness_deg": math.degrees(head.axes.squareness),
-            "pan_scale": float(head.axes.pan_scale),
-            "tilt_scale": float(head.axes.tilt_scale),
-            "pan_zero_deg": math.degrees(head.axes.pan_zero),
-            "tilt_zero_deg": math.degrees(head.axes.tilt_zero),
-            "jitter_deg": math.degrees(calibration.jitter),
-        },
-        "pitch_mm": calibration.pitch_mm,
-        "residuals": None if calibration.residuals is None else dataclasses.asdict(calibration.residuals),
-        "covariance": None
-        if covariance is None
-        else {"parameters": list(covariance.parameters), "matrix": covariance.matrix.tolist()},
-        "held_out": None if calibration.held_out is None else dataclasses.asdict(calibration.held_out),
-        "board": None if calibration.board is None else write_board(calibration.board),
-        "board_warp": [float(w) for w in calibration.board_warp],
-        "provenance": dict(calibration.provenance),
-        "views": [_write_view(view) for view in calibration.views],
-    }
+def _table(calibration: Calibration) -> CalibrationTable:
+    """Make the content of the file."""
+    zoom, covariance, degrees = calibration.zoom_head, calibration.covariance, math.degrees
+    axes = zoom.axes
+    lenses = zip(zoom.lens.nominal_px, zoom.lens.stops, zoom.lens.pupil, strict=True)
+    return CalibrationTable(
+        schema=SCHEMA,
+        fixed=FixedTable(calibration.fixed.size, *_numbers(calibration.fixed.lens)),
+        zoom=ZoomTable(zoom.lens.size, tuple(StopTable(px, *_numbers(lens), pupil) for px, lens, pupil in lenses)),
+        T_zoom0_fixed=zoom.T_zoom0_fixed,
+        T_head_zoom=zoom.T_head_zoom,
+        head=HeadTable(
+            axes.axis_offset,
+            degrees(axes.squareness),
+            axes.pan_scale,
+            axes.tilt_scale,
+            degrees(axes.pan_zero),
+            degrees(axes.tilt_zero),
+            degrees(calibration.jitter),
+        ),
+        pitch_mm=calibration.pitch_mm,
+        residuals=calibration.residuals,
+        covariance=None if covariance is None else CovarianceTable(covariance.parameters, covariance.matrix.tolist()),
+        held_out=calibration.held_out,
+        board=None if calibration.board is None else WrittenBoard(**vars(calibration.board)),
+        board_warp=calibration.board_warp,
+        provenance=calibration.provenance,
+        views=tuple(map(ViewTable.of, calibration.views)),
+    )
 
 
-def write_board(board: BoardConfig) -> dict[str, Any]:
-    """Make the JSON object of a board."""
-    return {"kind": board.kind, "corners": list(board.corners), "square": board.square}
+def _numbers(lens: Intrinsics) -> tuple[float, float, float, float, Any]:
+    return *lens.focal_px, *lens.center_px, lens.distortion
+
+
+def _plain(value: Any) -> Mapping[str, Any]:
+    """Convert a pose or a table for JSON."""
+    return pose_dict(value) if isinstance(value, RigidTransform) else vars(value)
 
 
 def _readable(table: dict[str, Any]) -> str:
@@ -442,15 +438,3 @@ def _readable(table: dict[str, Any]) -> str:
         else:
             lines.append(f'  "{key}": {json.dumps(value, allow_nan=False)}')
     return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def _write_intrinsics(camera: Intrinsics) -> dict[str, Any]:
-    (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
-    numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return {k: float(v) for k, v in numbers.items()} | {"distortion": [float(k) for k in camera.distortion]}
-
-
-def _write_view(view: View) -> dict[str, Any]:
-    corners = [corner if seen else None for corner, seen in zip(view.corners_px.tolist(), view.seen, strict=True)]
-    keys = ("camera", "board", "pan", "tilt", "focal_px", "t", "source")
-    return {key: getattr(view, key) for key in keys} | {"corners_px": corners}
