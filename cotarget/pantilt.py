@@ -65,6 +65,7 @@ class HeadGeometry:
 
 
 IDEAL_HEAD = HeadGeometry()
+E2, E3 = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def base_head(pan: float, tilt: float, head: HeadGeometry = IDEAL_HEAD) -> RigidTransform:
@@ -78,6 +79,40 @@ def base_head(pan: float, tilt: float, head: HeadGeometry = IDEAL_HEAD) -> Rigid
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = turned, (panning - turned)[:, 2] * head.axis_offset
     return RigidTransform(T, normalize=False)
+
+
+def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Array, Array]:
+    """Compute T_base_head of many reported pan and tilt [rad], (v,) each.
+
+    Returns its rotations (v, 3, 3) and translations (v, 3), and the rotations A of tilt alone (v, 3, 3).
+    """
+    pan, tilt = head.true_angles(pan, tilt)
+    turns = Rotation.from_rotvec(np.multiply.outer(pan, E2)).as_matrix()
+    A = Rotation.from_rotvec(np.multiply.outer(tilt, head.tilt_axis)).as_matrix()
+    offset = head.axis_offset * (E3 - A @ E3)  # Trans(dz) A Trans(-dz) is A with this translation
+    return turns @ A, np.einsum("vij,vj->vi", turns, offset), A
+
+
+def by_axes(head: HeadGeometry, A: Array, x_head: Array) -> Array:
+    """Compute the derivatives of x_head by dz and by eps, (v, N, 3, 2).
+
+    With A the rotation of tilt, x_head = A^T (q - dz e3) + dz e3 where q = Rot(Y, -pan) x_base.
+    """
+    by_dz = np.broadcast_to((E3 - A[:, 2])[:, None], x_head.shape)  # A^T e3 is A's third row
+    # A = Rot(Z, eps) Rot(X, tilt) Rot(Z, -eps), so dA^T/deps = [e3]x A^T - A^T [e3]x
+    a = x_head - head.axis_offset * E3
+    u = a @ A.swapaxes(1, 2)
+    by_eps = np.cross(E3, a) - np.cross(E3, u) @ A
+    return np.stack([by_dz, by_eps], axis=-1)
+
+
+def by_turn(head: HeadGeometry, A: Array, x_head: Array) -> Array:
+    """Compute the derivatives of x_head by true pan and true tilt, (v, N, 3, 2), with A and q as in `by_axes`."""
+    a = x_head - head.axis_offset * E3
+    q = a @ A.swapaxes(1, 2) + head.axis_offset * E3
+    by_pan = -np.cross(E2, q) @ A  # dq/dpan = -e2 x q, then A^T
+    by_tilt = -np.cross(head.tilt_axis, a)
+    return np.stack([by_pan, by_tilt], axis=-1)
 
 
 def towards(x_base: Array) -> tuple[float, float]:
@@ -112,13 +147,9 @@ def miss(
 
     It shares no code with `solve`, so that it can check it; see there for the arguments.
     """
-    pan, tilt = head.true_angles(pan, tilt)
     shape = np.broadcast_shapes(np.shape(pan), np.shape(tilt), np.shape(x_base)[:-1])
-    dz = np.array([0.0, 0.0, head.axis_offset])
-    pans = Rotation.from_rotvec(np.multiply.outer(np.broadcast_to(pan, shape).ravel(), [0.0, 1.0, 0.0]))
-    tilts = Rotation.from_rotvec(np.multiply.outer(np.broadcast_to(tilt, shape).ravel(), head.tilt_axis))
-    points = np.array(np.broadcast_to(x_base, (*shape, 3))).reshape(-1, 3)
-    x_head = tilts.inv().apply(pans.inv().apply(points) - dz) + dz
+    R, t, _ = base_heads(head, np.broadcast_to(pan, shape).ravel(), np.broadcast_to(tilt, shape).ravel())
+    x_head = np.einsum("vji,vj->vi", R, np.broadcast_to(x_base, (*shape, 3)).reshape(-1, 3) - t)
     x_zoom = T_head_zoom.inv().apply(x_head).reshape(*shape, 3)
     return angle_between(x_zoom, np.broadcast_to(np.asarray(ray, float), x_zoom.shape))
 

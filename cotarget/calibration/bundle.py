@@ -29,7 +29,7 @@ from cotarget.calibration.model import BundleModel, View
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from cotarget.pantilt import HeadGeometry
+from cotarget.pantilt import E3, base_heads, by_axes, by_turn
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 
 Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "warp", "k3", "scale", "zero"]
@@ -194,8 +194,6 @@ def _bent(lens: Intrinsics, step: Array) -> Intrinsics:
 
 # Reprojection of the corners
 
-E3 = np.array([0.0, 0.0, 1.0])
-
 
 @dataclass(frozen=True, eq=False)
 class Batch:
@@ -309,13 +307,13 @@ def _points_in_camera(model: BundleModel, batch: Batch, points: Array) -> tuple[
     R_xv = R_xp @ R_p.swapaxes(1, 2)  # dx/dv
     R_xw = R_xv @ R_h  # dx/dw
     d_hand = R_xv[:, None] @ _pose_derivative(turned_h) - R_xp @ _pose_derivative(p - t_h)
-    d_turn = R_xp @ _by_turn(head.axes, A, p)
+    d_turn = R_xp @ by_turn(head.axes, A, p)
     return x, {
         "board": (R_xw @ R_g)[:, None] @ d_board,
         "warp": (R_xw @ R_g)[:, None] @ d_warp,
         "gamma": R_xw[:, None] @ _pose_derivative(turned_g),
         "hand": d_hand,
-        "head": R_xp @ _by_head(head.axes, A, p),
+        "head": R_xp @ by_axes(head.axes, A, p),
         "scale": d_turn * np.stack([batch.pan, batch.tilt], axis=-1)[:, None, None],
         "zero": d_turn,
         "turn": d_turn,
@@ -327,40 +325,6 @@ def _bulge(points: Array) -> Array:
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     half = np.maximum((high - low) / 2, np.finfo(float).tiny)
     return np.asarray(1 - ((points[:, :2] - (low + high) / 2) / half) ** 2)
-
-
-def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Array, Array]:
-    """Compute T_base_head of reported pan and tilt [rad], (v,) each (Eq. 8 with dz and eps).
-
-    Returns its rotations (v, 3, 3) and translations (v, 3), and the rotations of tilt alone (v, 3, 3).
-    """
-    pan, tilt = head.true_angles(pan, tilt)
-    turns = Rotation.from_rotvec(pan[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
-    A = Rotation.from_rotvec(tilt[:, None] * head.tilt_axis).as_matrix()
-    offset = head.axis_offset * (E3 - A @ E3)  # Trans(dz) A Trans(-dz) is A with this translation
-    return turns @ A, np.einsum("vij,vj->vi", turns, offset), A
-
-
-def _by_head(head: HeadGeometry, A: Array, x_head: Array) -> Array:
-    """Compute the derivatives of x_head by dz and by eps, (v, N, 3, 2).
-
-    With A the rotation of tilt, x_head = A^T (q - dz e3) + dz e3 where q = Rot(Y, -pan) x_base.
-    """
-    by_dz = np.broadcast_to((E3 - A[:, 2])[:, None], x_head.shape)  # A^T e3 is A's third row
-    # A = Rot(Z, eps) Rot(X, tilt) Rot(Z, -eps), so dA^T/deps = [e3]x A^T - A^T [e3]x
-    a = x_head - head.axis_offset * E3
-    u = a @ A.swapaxes(1, 2)
-    by_eps = np.cross(E3, a) - np.cross(E3, u) @ A
-    return np.stack([by_dz, by_eps], axis=-1)
-
-
-def _by_turn(head: HeadGeometry, A: Array, x_head: Array) -> Array:
-    """Compute the derivatives of x_head by true pan and true tilt, (v, N, 3, 2), with A and q as in `_by_head`."""
-    a = x_head - head.axis_offset * E3
-    q = a @ A.swapaxes(1, 2) + head.axis_offset * E3
-    by_pan = -np.cross(np.array([0.0, 1.0, 0.0]), q) @ A  # dq/dpan = -e2 x q, then A^T
-    by_tilt = -np.cross(head.tilt_axis, a)
-    return np.stack([by_pan, by_tilt], axis=-1)
 
 
 def _pose_derivative(turned: Array) -> Array:

@@ -12,14 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.board import board_outline, board_points
-from cotarget.calibration.bundle import Block, Fit, base_heads, information, parameter_names
+from cotarget.calibration.bundle import Block, Fit, information, parameter_names
 from cotarget.calibration.model import BundleModel, View, unseen
 from cotarget.calibration.uncertainty import miss_derivatives
 from cotarget.camera import Intrinsics
 from cotarget.config import BoardConfig
 from cotarget.errors import UnreachableError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from cotarget.pantilt import nearest, solve
+from cotarget.pantilt import base_heads, nearest, solve
 from cotarget.rig import PanTiltLimits
 from cotarget.rig_geometry import ZoomHead
 

@@ -23,7 +23,6 @@ from cotarget.calibration.bundle import (
     Fit,
     Prior,
     Problem,
-    base_heads,
     batches_of,
     fit,
     masked,
@@ -39,7 +38,7 @@ from cotarget.calibration.initialization import of_both
 from cotarget.calibration.model import BundleModel, Covariance, HeldOut, View
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
-from cotarget.pantilt import solve
+from cotarget.pantilt import base_heads, solve
 
 # Consider covariance
 
