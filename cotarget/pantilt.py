@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from cotarget.errors import UnreachableError
-from cotarget.geometry import Array, RigidTransform, Rotation, angle_between
+from cotarget.geometry import Array, RigidTransform, Rotation
 
 
 @dataclass(frozen=True)
@@ -133,25 +133,6 @@ def zoom_fixed(
 ) -> RigidTransform:
     """Compute T_zoom_fixed, from the fixed camera to the zoom camera moved by reported pan and tilt [rad] (Eq. 2)."""
     return T_head_zoom.inv() * base_head(pan, tilt, head).inv() * T_head_zoom * T_zoom0_fixed
-
-
-def miss(
-    pan: Array,
-    tilt: Array,
-    x_base: Array,
-    T_head_zoom: RigidTransform,
-    head: HeadGeometry = IDEAL_HEAD,
-    ray: Array | tuple[float, float, float] = (0.0, 0.0, 1.0),
-) -> Array:
-    """Compute the pointing error: the angle between the zoom camera's ray and the target [rad].
-
-    It shares no code with `solve`, so that it can check it; see there for the arguments.
-    """
-    shape = np.broadcast_shapes(np.shape(pan), np.shape(tilt), np.shape(x_base)[:-1])
-    R, t, _ = base_heads(head, np.broadcast_to(pan, shape).ravel(), np.broadcast_to(tilt, shape).ravel())
-    x_head = np.einsum("vji,vj->vi", R, np.broadcast_to(x_base, (*shape, 3)).reshape(-1, 3) - t)
-    x_zoom = T_head_zoom.inv().apply(x_head).reshape(*shape, 3)
-    return angle_between(x_zoom, np.broadcast_to(np.asarray(ray, float), x_zoom.shape))
 
 
 # Rounds of the closed form for dz != 0. Each shrinks the error by dz / range, a thousandfold for a usual head.
