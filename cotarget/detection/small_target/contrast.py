@@ -1,0 +1,333 @@
+"""Find places that stand out from the ring around them, at several scales.
+
+This is a constant false alarm rate detector (Rohling 1983) in two dimensions.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from cotarget.geometry import Array
+from cotarget.rig import Image
+
+# Side of the square at a target's centre at the finest scale [px]; each further scale doubles all lengths.
+INNER_PX = 3
+# Inner and outer side of the ring, in pixels of an image of half the size: 14 and 22 px. The target lies inside.
+GUARD_HALF_PX, OUTER_HALF_PX = 7, 11
+# Scales, for targets of up to 12 px to those of up to 400; in the difference, of up to 50.
+SCALES, SCALES_OF_DIFFERENCE = 6, 3
+# How far the largest ring of the difference reaches, and the side of a pixel of its largest scale [px].
+REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES_OF_DIFFERENCE, 2**SCALES_OF_DIFFERENCE
+# First scale whose ring, 90 px, is so large that a sky's gradient counts.
+SLOPING_SCALE = 2
+# Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
+LEAST_ROUGHNESS = 1.5
+# Factor by which the roughness of the surroundings counts where targets of one or two pixels are searched, in the mean
+# of 2x2 px or in an image of twice the size: leaves and grass have such spots, a sky has none.
+SMALLEST_TIMES = 2.0
+# How far beside a target other texture counts: in parts of its larger side, and in pixels of the texture.
+BESIDE, BESIDE_PX = 2.0, 6.0
+# Part of the contrast at which a target's outline lies.
+OUTLINE = 0.33
+# From this scale on, wings and rotors that are fainter than the body belong to the target: what stands out by this
+# many standard deviations of the surroundings, brighter or darker, and by a least part of the contrast.
+LARGE_SCALE, FAINT, FAINTEST = 2, 3.0, 0.05
+# Window of the mean that a pixel is compared with for its texture [px]. Bright and dark parts of an aeroplane cancel in
+# the mean of a coarse scale; in the sky around it there is no texture.
+TEXTURE_PX = (5, 5)
+# Outlines are found this many scales finer than the peak, which bounds the window's size.
+WINDOW_SCALES = 3
+# The lens' blur is as faint: it reaches this far around the body [px].
+BLUR_PX = 2.5
+
+
+@dataclass(frozen=True)
+class SmallTarget:
+    """A small region that stands out from its surroundings.
+
+    Attributes:
+        low: first column and row of its box [px].
+        size: width and height of its box [px].
+        contrast: grey level of its centre less that of the surroundings; negative if darker.
+        signal: absolute contrast, in standard deviations of the surroundings.
+        around: mean grey level of the surroundings.
+        beside: largest texture beside it [grey levels]: little in the sky, much at a mast or a twig; inf if unknown.
+        since: its change since each of `AGES_S`, nan if unknown; () if it was not compared.
+    """
+
+    low: tuple[int, int]
+    size: tuple[int, int]
+    contrast: float
+    signal: float
+    around: float
+    beside: float = 0.0
+    since: tuple[float, ...] = ()
+
+
+def find_small_targets(
+    grey: Image,
+    threshold: float,
+    most: int,
+    *,
+    finer: Sequence[Image] = (),
+    scales: int = SCALES,
+    of_difference: bool = False,
+) -> list[SmallTarget]:
+    """Find regions that stand out at any scale, without overlaps, the strongest first.
+
+    Args:
+        grey: image, (H, W).
+        threshold: least contrast, in standard deviations of the surroundings.
+        most: most regions returned, and most examined at each scale; bounds the computing time.
+        finer: images of which ``grey`` is a halving, the finest first; outlines and boxes are in pixels of the first.
+        scales: number of scales.
+        of_difference: whether the image is a difference of two, in which dark regions and texture mean nothing.
+    """
+    levels, first = [*finer, grey], len(finer)
+    texture: Image | None = None
+    peaks: list[_Peak] = []
+    for scale in range(first, first + scales):
+        level = levels[scale]
+        if min(level.shape) < 2 * OUTER_HALF_PX:
+            break
+        levels.append(cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        above = levels[scale - 1] if scale == first and first else None
+        sloping, finest = scale - first >= SLOPING_SCALE, scale == 0 and not of_difference
+        peaks += _peaks(level, levels[-1], scale, sloping, threshold, most, above, finest)
+        if scale - first > LARGE_SCALE and texture is not None:
+            texture = cv2.resize(texture, level.shape[::-1], interpolation=cv2.INTER_AREA)
+            peaks += _textured(texture, levels[-1], scale, threshold, most)
+        elif scale - first == LARGE_SCALE and not of_difference:
+            texture = fine_texture = cv2.absdiff(level, cv2.blur(level, TEXTURE_PX))
+    peaks.sort(key=lambda peak: -peak.signal)
+    kept: list[SmallTarget] = []
+    for peak in peaks:
+        at = (peak.u + 0.5) * 2**peak.scale, (peak.v + 0.5) * 2**peak.scale
+        if any(_contains(target, at) for target in kept):
+            continue
+        large = peak.scale - first >= LARGE_SCALE
+        target = _outline(levels, peak, large, of_difference)
+        if target is not None and not any(share(target, other) for other in kept):
+            kept.append(target)
+            if len(kept) == most:
+                break
+    if texture is None:
+        return kept
+    return [replace(target, beside=_beside(fine_texture, target, 2 ** (first + LARGE_SCALE))) for target in kept]
+
+
+def _contains(target: SmallTarget, at: tuple[float, float]) -> bool:
+    """Whether a target's box contains a place [px]."""
+    return all(low <= x < low + size for low, size, x in zip(target.low, target.size, at, strict=True))
+
+
+def _beside(texture: Image, target: SmallTarget, unit: int) -> float:
+    """Find the largest texture around a target but not in it; ``unit`` is the side of the texture's pixels [px]."""
+    side = max(target.size) / unit
+    u, v = ((low + size / 2) / unit for low, size in zip(target.low, target.size, strict=True))
+    outer, inner = (0.5 + BESIDE) * side + BESIDE_PX, 0.75 * side + 2
+    left, top = max(0, round(u - outer)), max(0, round(v - outer))
+    window = texture[top : round(v + outer) + 1, left : round(u + outer) + 1].copy()
+    x, y = max(0, round(u - inner) - left), max(0, round(v - inner) - top)
+    window[y : round(v + inner) - top + 1, x : round(u + inner) - left + 1] = 0
+    return float(window.max(initial=0))
+
+
+@dataclass(frozen=True)
+class _Peak:
+    """A peak of contrast: its pixel (u, v) at a scale, its signal, and the ring's mean."""
+
+    u: int
+    v: int
+    scale: int
+    signal: float
+    around: float
+
+
+def _limits(mean: Array, deviation: Array, threshold: float, size: tuple[int, int]) -> tuple[Image, Image]:
+    """Grey levels beyond which a pixel stands out, in an image of a size (width, height) [px].
+
+    In bytes, which is three times as fast; half a grey level is little beside ``threshold`` deviations.
+    """
+    margin = deviation * np.float32(threshold)
+    low, high = cv2.subtract(mean, margin, dtype=cv2.CV_8U), cv2.add(mean, margin, dtype=cv2.CV_8U)
+    return np.asarray(cv2.resize(low, size), dtype=np.uint8), np.asarray(cv2.resize(high, size), dtype=np.uint8)
+
+
+def _peaks(
+    level: Image,
+    half: Image,
+    scale: int,
+    sloping: bool,
+    threshold: float,
+    most: int,
+    finer: Image | None = None,
+    finest: bool = False,
+) -> list[_Peak]:
+    """Find peaks of contrast at one scale, the strongest first.
+
+    Args:
+        level: image at this scale, (H, W).
+        half: the same in half the size.
+        scale: number of halvings.
+        sloping: whether to fit a plane to the ring.
+        threshold: least contrast, in standard deviations of the surroundings.
+        most: most peaks.
+        finer: image of twice the size in which targets of one or two pixels are searched too; None for none.
+        finest: whether these are searched in this image instead.
+    """
+    mean, deviation = _ring(half, sloping)
+    size = (level.shape[1], level.shape[0])
+    blurred = cv2.boxFilter(level, -1, (INNER_PX, INNER_PX))
+    searched = [(blurred, blurred, deviation)]  # darkest and brightest around each pixel, roughness of the surroundings
+    if finer is not None or finest:
+        rougher = deviation * np.float32(SMALLEST_TIMES) - np.float32((SMALLEST_TIMES - 1) * LEAST_ROUGHNESS)
+        if finer is None:
+            # Linear interpolation halfway between pixels is the mean of 2x2 px, at a third of boxFilter's time.
+            dark = bright = cv2.getRectSubPix(level, size, (size[0] / 2 - 1, size[1] / 2 - 1))
+        else:
+            blurred, pair = cv2.boxFilter(finer, -1, (INNER_PX, INNER_PX)), np.ones((2, 2), np.uint8)
+            dark, bright = (
+                cv2.resize(of(blurred, pair), size, interpolation=cv2.INTER_NEAREST) for of in (cv2.erode, cv2.dilate)
+            )
+        searched.append((dark, bright, rougher))
+    off = np.zeros(level.shape, np.uint8)
+    for dark, bright, roughness in searched:
+        low, high = _limits(mean, roughness, threshold, size)
+        off = cv2.max(off, cv2.max(cv2.subtract(low, dark), cv2.subtract(bright, high)))
+    mask = cv2.compare(off, 0, cv2.CMP_GT)
+    peaks = []
+    for contour in cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
+        x, y, w, h = cv2.boundingRect(contour)
+        if max(w, h) > 2 * GUARD_HALF_PX:  # it reaches into its own ring and is left to the next scale
+            continue
+        _, _, _, (i, j) = cv2.minMaxLoc(off[y : y + h, x : x + w])
+        u, v = x + i, y + j
+        at = (min(v // 2, half.shape[0] - 1), min(u // 2, half.shape[1] - 1))
+        around = float(mean[at])
+        signal = max(
+            max(float(bright[v, u]) - around, around - float(dark[v, u])) / float(roughness[at])
+            for dark, bright, roughness in searched
+        )
+        peaks.append(_Peak(u, v, scale, signal, around))
+    peaks.sort(key=lambda peak: -peak.signal)
+    return peaks[:most]
+
+
+def _textured(texture: Image, half: Image, scale: int, threshold: float, most: int) -> list[_Peak]:
+    """Find peaks of texture, as `_peaks` does, with the mean of the ring in the image of half the size."""
+    coarse = cv2.resize(texture, half.shape[::-1], interpolation=cv2.INTER_AREA)
+    peaks = _peaks(texture, coarse, scale, False, threshold, most)
+    if not peaks:
+        return []
+    mean, _ = _ring(half, False)
+    height, width = mean.shape
+    return [replace(p, around=float(mean[min(p.v // 2, height - 1), min(p.u // 2, width - 1)])) for p in peaks]
+
+
+def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
+    """Mean of the ring around each pixel, and the standard deviation from that mean or from a fitted plane.
+
+    Args:
+        half: image of half the size.
+        sloping: whether to fit a plane, for rings so large that a sky's gradient counts.
+    """
+    total = _box_sum(half, cv2.boxFilter)
+    squares = _box_sum(half, cv2.sqrBoxFilter)
+    count = np.float32(OUTER_HALF_PX**2 - GUARD_HALF_PX**2)
+    mean = total / count
+    variance = squares / count - mean * mean
+    if not sloping:
+        return mean, cv2.sqrt(np.maximum(variance, np.float32(LEAST_ROUGHNESS**2)))
+    # The slope along each axis is the ring's first moment over its second moment along that axis.
+    moment = np.float32((_axis_moment(OUTER_HALF_PX) - _axis_moment(GUARD_HALF_PX)) * count)
+    for k in (0, 1):
+        first = _first_moment(half, OUTER_HALF_PX, k)
+        cv2.subtract(first, _first_moment(half, GUARD_HALF_PX, k), first)
+        variance -= first * first / moment
+    return mean, cv2.sqrt(np.maximum(variance, np.float32(LEAST_ROUGHNESS**2)))
+
+
+def _box_sum(half: Image, box: Callable[..., Array]) -> Array:
+    """Sum of the image, or of its squares, over the ring around each pixel."""
+    total = box(half, cv2.CV_32F, (OUTER_HALF_PX,) * 2, normalize=False)
+    return cv2.subtract(total, box(half, cv2.CV_32F, (GUARD_HALF_PX,) * 2, normalize=False), total)
+
+
+def _axis_moment(side: int) -> float:
+    """Sum over a square of the squared distance from its middle column."""
+    return side * float(np.sum(np.square(np.arange(side) - side // 2)))
+
+
+def _first_moment(half: Image, side: int, axis: int) -> Array:
+    """Sum over a square of the image times the distance from its middle along an axis (0: columns)."""
+    kernels = [np.ones(side, np.float32)] * 2
+    kernels[axis] = np.arange(side, dtype=np.float32) - side // 2
+    return np.asarray(cv2.sepFilter2D(half, cv2.CV_32F, kernels[0], kernels[1]))
+
+
+def _outline(levels: Sequence[Image], peak: _Peak, large: bool, of_difference: bool) -> SmallTarget | None:
+    """Find the box of a peak, in the image of a finer scale; None if its outline leaves the ring.
+
+    Args:
+        levels: image, (H, W), and its halvings.
+        peak: the peak.
+        large: whether faint parts belong to the target.
+        of_difference: whether the target is brighter than its surroundings in all its parts, as in a difference.
+    """
+    scale, around = peak.scale, peak.around
+    fine = max(0, scale - WINDOW_SCALES)
+    image, factor, unit = levels[fine], 2 ** (scale - fine), 2**fine
+    u, v = factor * peak.u + factor // 2, factor * peak.v + factor // 2
+    reach = factor * GUARD_HALF_PX
+    left, top = max(0, u - reach), max(0, v - reach)
+    window = image[top : v + reach + 1, left : u + reach + 1].astype(np.float32) - np.float32(around)
+    near = window[max(0, v - top - factor) : v - top + factor + 1, max(0, u - left - factor) : u - left + factor + 1]
+    j, i = (int(n) for n in np.unravel_index(int(np.argmax(np.abs(near))), near.shape))
+    contrast = float(near[j, i])
+    at = max(0, v - top - factor) + j, max(0, u - left - factor) + i
+    # An aeroplane has bright and dark parts.
+    inside = window * np.sign(contrast) if of_difference else np.abs(window)
+    x, y, w, h = _component(inside > OUTLINE * abs(contrast), at)
+    if large and not of_difference:
+        part = min(OUTLINE, max(FAINT / peak.signal, FAINTEST))
+        X, Y, W, H = _component(np.abs(window - _slope(window)) > part * abs(contrast), at)
+        if max(x - X, y - Y, X + W - x - w, Y + H - y - h) * unit > BLUR_PX + unit:
+            x, y, w, h = X, Y, W, H
+    bottom, right = window.shape
+    across = (x == 0 and left > 0) or (x + w == right and left + right < image.shape[1])
+    down = (y == 0 and top > 0) or (y + h == bottom and top + bottom < image.shape[0])
+    if across or down:
+        return None  # it goes on beyond its ring: a pole, or a target for the next scale
+    return SmallTarget((unit * (left + x), unit * (top + y)), (unit * w, unit * h), contrast, peak.signal, around)
+
+
+def _slope(window: np.ndarray) -> np.ndarray:
+    """Estimate the surroundings' slope from the window's border, zero in the middle, (h, w)."""
+    down, across = (
+        (_median(last) - _median(first)) * np.linspace(-0.5, 0.5, n, dtype=np.float32)
+        for first, last, n in (
+            (window[0], window[-1], window.shape[0]),
+            (window[:, 0], window[:, -1], window.shape[1]),
+        )
+    )
+    return down[:, None] + across
+
+
+def _median(values: np.ndarray) -> float:
+    """Median of a few values, (n,), eight times as fast as np.median."""
+    ordered, n = np.sort(values), len(values)
+    return float(ordered[(n - 1) // 2] + ordered[n // 2]) / 2
+
+
+def _component(inside: np.ndarray, at: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Find the box of the connected component at a pixel (row, column): left, top, width and height."""
+    x, y, w, h = cv2.floodFill(inside.astype(np.uint8), None, at[::-1], (2,), flags=8)[3]
+    return x, y, w, h
+
+
+def share(one: SmallTarget, other: SmallTarget) -> bool:
+    """Whether the boxes of two regions overlap."""
+    return all(a < b + n and b < a + m for a, m, b, n in zip(one.low, one.size, other.low, other.size, strict=True))

@@ -1,0 +1,244 @@
+"""Detect small targets by contrast and change, each with a score, and in the difference from earlier images."""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from cotarget.detection.base import Detections, box_detection, check_size, is_clipped, moved
+from cotarget.detection.small_target.camera_motion import CameraMotion
+from cotarget.detection.small_target.change import AGES_S, History, changes
+from cotarget.detection.small_target.contrast import (
+    ALIGNED_PX,
+    INNER_PX,
+    LEAST_ROUGHNESS,
+    REACH_PX,
+    SCALES_OF_DIFFERENCE,
+    SmallTarget,
+    find_small_targets,
+    share,
+)
+from cotarget.detection.small_target.score import WEIGHTS, Weights, small_target_score
+from cotarget.geometry import Array
+from cotarget.rig import Detection, Frame, Image
+
+if TYPE_CHECKING:
+    from cotarget.tracking.track import Track
+
+
+# Least contrast, in standard deviations of the surroundings.
+LEAST_SIGNAL = 4.5
+# Most regions examined in a frame, the strongest first; bounds the computing time.
+MOST_TARGETS = 40
+# Steepness of the score of a region of the difference.
+SLOPE = 3.4
+# Least score of a detection; a target that stays quiet for a moment is above it.
+LEAST_SCORE = 0.02
+# Score from which a region is more likely a target than not.
+BELIEVED_SCORE = 0.5
+# Change from which a region has arrived as a whole; for a sign with a bird flying in front of it, it is a tenth.
+ARRIVED = 0.5
+# Least signal in the difference from all earlier images, and the signal with a score of 0.5. In the simulated field,
+# swaying foliage is above the latter once in six frames, anywhere; a bird in front of it in nineteen of twenty.
+LEAST_DIFFERENCE, EVEN_DIFFERENCE = 7.0, 12.0
+# Fewest of the AGES_S for which there must be an image.
+FEWEST_EARLIER = 3
+# Shift of the camera between two images up to which they are subtracted as they are, and up to which after they are
+# registered [px].
+STANDING_PX, SHAKING_PX = 0.5, 5.0
+# Usual difference, such as of a swaying branch, subtracted from the difference: its factor, the weight of the newest
+# image that is kept in its mean, and the width over which it spreads [px].
+USUAL_TIMES, USUAL_GAIN, SWAY_PX = 3.0, 0.02, 5
+# Largest score of a clipped box, which may continue a track but not begin one: half of its surroundings are outside the
+# image, so a swaying twig looks isolated.
+MOST_CLIPPED_SCORE = 0.45
+# Images are halved until they are at most this wide [px]; targets are outlined in full resolution. Small images are
+# doubled while their larger side stays within it, at most twice: a bird of one pixel then fills more of the finest
+# scale, INNER_PX.
+WIDEST_PX, MOST_TIMES = 960, 4
+# Least contrast in an image that was doubled twice and has more noise than LEAST_ROUGHNESS: its finest scale lies
+# within one pixel of the camera, so the mean does not reduce the noise.
+NOISY_SIGNAL = 5.5
+# Least span of the history before anything is detected: at first, when it has an image of the shortest age; and after a
+# cut, whose new scene must be seen for a while [s].
+WARM_UP_S, AFTER_CUT_S = 0.09, AGES_S[1]
+
+
+class SmallTargetDetector:
+    """Detect small targets by contrast and change, each with a score."""
+
+    def __init__(self, least_score: float = LEAST_SCORE, weights: Weights = WEIGHTS) -> None:
+        """Start without history; ``least_score`` is that of a detection."""
+        self._least_score, self._weights = least_score, weights
+        self.camera = CameraMotion()
+        self._history = History()
+        self._warm_up_s = WARM_UP_S
+        self._usual: Image | None = None  # mean difference from earlier images, float32
+        self.shift: Array = np.zeros(2)  # of the camera since the first frame [px], (2,)
+        self._shape: tuple[int, ...] | None = None
+        self.repeated = False  # whether the last frame repeats the one before
+
+    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+        """Detect regions that stand out and change.
+
+        A frame that repeats the last one gives no detections.
+
+        Raises:
+            CotargetError: the image's size changed.
+        """
+        return self.search(frame)[1]
+
+    def search(self, frame: Frame) -> tuple[list[SmallTarget], Detections]:
+        """Detect as `detect` does; also return the region of each box, in the enlarged image of a small one."""
+        check_size(self._shape, frame.image)
+        self._shape = frame.image.shape
+        grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+        finer: list[Image] = []
+        while grey.shape[1] > WIDEST_PX:
+            finer.append(grey)
+            grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        unit = 2 ** len(finer)
+        shift = self.camera.update(grey)  # measured without enlargement, in which soft scenes have no corners
+        self.shift = unit * shift
+        grey, times = (grey, 1) if finer else _enlarged(grey)
+        shift = times * shift
+        if self.camera.jumped:
+            self._history.clear()
+            self._warm_up_s = AFTER_CUT_S
+        references = self._history.references(frame.t)
+        self.repeated = not self._history.add(frame.t, grey, shift)
+        if self.repeated or self._history.span < self._warm_up_s:
+            return [], Detections([], functools.partial(_mask, [], frame.image.shape, times))
+        self._warm_up_s = WARM_UP_S
+        shape = tuple(times * side for side in frame.image.shape[:2])
+        found: list[tuple[SmallTarget, Detection]] = []
+        arrived: list[tuple[SmallTarget, Detection]] = []
+        noisy = times == MOST_TIMES and self._history.noise > LEAST_ROUGHNESS
+        for target in find_small_targets(grey, NOISY_SIGNAL if noisy else LEAST_SIGNAL, MOST_TARGETS, finer=finer):
+            low = target.low[0] // unit, target.low[1] // unit
+            size = -(-target.size[0] // unit), -(-target.size[1] // unit)
+            since = changes(grey, low, size, target.around, shift, self._history.noise, references)
+            target = replace(target, since=tuple(since))
+            score = small_target_score(target.signal, since, target.beside, self._weights)
+            detection = _boxed(target, score, shape, times)
+            if detection.score >= self._least_score:
+                found.append((target, detection))
+            if detection.score >= BELIEVED_SCORE and np.nanmax(since) >= ARRIVED:
+                arrived.append((target, detection))
+        differing = self._differing(grey, unit, times, shift, references)
+        found = _best_of(found + [_as_a_whole(pair, arrived) for pair in differing])
+        boxes = [detection for _, detection in found]
+        return [target for target, _ in found], Detections(
+            boxes, functools.partial(_mask, found, frame.image.shape, times)
+        )
+
+    def _differing(
+        self, grey: Image, unit: int, times: int, shift: Array, references: list[tuple[Image, Array] | None]
+    ) -> list[tuple[SmallTarget, Detection]]:
+        """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
+
+        The difference of an image enlarged by a factor ``times`` is halved: a twig sways over more of its pixels.
+        """
+        earlier = [kept for kept in references if kept is not None]
+        if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > times * SHAKING_PX for _, then in earlier):
+            self._usual = None
+            return []
+        registered = (
+            picture if np.abs(shift - then).max() <= STANDING_PX else moved(picture, shift - then)
+            for picture, then in earlier
+        )
+        difference = functools.reduce(cv2.min, (cv2.absdiff(grey, picture) for picture in registered))
+        pixel = unit  # side of a pixel of the difference
+        if times > 1:
+            pixel = 2
+            difference = cv2.resize(difference, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        if self._usual is None:
+            self._usual = np.zeros(difference.shape, np.float32)
+        usual = cv2.dilate(cv2.convertScaleAbs(self._usual, alpha=USUAL_TIMES), np.ones((SWAY_PX, SWAY_PX), np.uint8))
+        if self._history.kept_last:  # not every frame of a fast camera: it would become usual sooner
+            cv2.accumulateWeighted(difference, self._usual, USUAL_GAIN)
+        unusual = cv2.subtract(difference, usual)
+        # A sky is zero but for the target; its surroundings are needed as well.
+        least = LEAST_DIFFERENCE * LEAST_ROUGHNESS
+        there = cv2.threshold(cv2.blur(unusual, (INNER_PX,) * 2), least, 255, cv2.THRESH_BINARY)[1]
+        left, top, width, height = cv2.boundingRect(there)
+        if not width:
+            return []
+        left, top, right, bottom = (left - REACH_PX, top - REACH_PX, left + width + REACH_PX, top + height + REACH_PX)
+        left, top = max(0, left) // ALIGNED_PX * ALIGNED_PX, max(0, top) // ALIGNED_PX * ALIGNED_PX
+        found = []
+        for target in find_small_targets(
+            unusual[top:bottom, left:right],
+            LEAST_DIFFERENCE,
+            MOST_TARGETS,
+            scales=SCALES_OF_DIFFERENCE,
+            of_difference=True,
+        ):
+            if target.contrast <= 0:
+                continue
+            score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE))
+            (x, y), (w, h) = target.low, target.size
+            target = replace(
+                target, low=(pixel * (left + x), pixel * (top + y)), size=(pixel * w, pixel * h), beside=math.inf
+            )
+            found.append((target, _boxed(target, score, (unit * grey.shape[0], unit * grey.shape[1]), times)))
+        return found
+
+
+def _enlarged(grey: Image) -> tuple[Image, int]:
+    """Double an image while its larger side stays within WIDEST_PX; return it and its factor."""
+    times = 1
+    while times < MOST_TIMES and 2 * times * max(grey.shape) <= WIDEST_PX:
+        times *= 2
+    if times == 1:
+        return grey, times
+    enlarged = cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+    return np.asarray(enlarged, dtype=np.uint8), times
+
+
+def _mask(found: Sequence[tuple[SmallTarget, Detection]], shape: tuple[int, ...], times: int) -> Image:
+    """Draw regions of an image enlarged by a factor ``times`` into one of a shape (H, W, 3), by their scores."""
+    mask = np.zeros(shape[:2], np.uint8)
+    for target, detection in reversed(found):
+        (x, y), (w, h) = target.low, target.size
+        rows, columns = slice(y // times, -(-(y + h) // times)), slice(x // times, -(-(x + w) // times))
+        mask[rows, columns] = round(255 * detection.score)
+    return mask
+
+
+def _boxed(target: SmallTarget, score: float, shape: tuple[int, ...], times: int) -> Detection:
+    """Make a detection of a region of an image of a shape (H, W), enlarged by a factor ``times``."""
+    box = box_detection(*target.low, *target.size, score, shape)
+    # Interpolation spreads the camera's last pixel over ``times`` pixels.
+    if is_clipped(box.center_px, box.size_px + 2 * (times - 1), shape):
+        box = replace(box, score=min(score, MOST_CLIPPED_SCORE), clipped=True)
+    return replace(box, center_px=(box.center_px + 0.5) / times - 0.5, size_px=box.size_px / times)
+
+
+def _as_a_whole(
+    differing: tuple[SmallTarget, Detection], arrived: list[tuple[SmallTarget, Detection]]
+) -> tuple[SmallTarget, Detection]:
+    """Replace a region of the difference by the arrived region that contains it, if there is one.
+
+    Of a plain target that moves by less than its own length within AGES_S[0], only the front differs; its contrast
+    shows all of it. A standing thing behind a target differs as well, but has not arrived.
+    """
+    target, detection = differing
+    around = [pair for pair in arrived if share(pair[0], target)]
+    if len(around) != 1 or math.prod(around[0][0].size) <= math.prod(target.size):
+        return differing
+    whole, box = around[0]
+    return whole, replace(box, score=max(box.score, detection.score))
+
+
+def _best_of(found: list[tuple[SmallTarget, Detection]]) -> list[tuple[SmallTarget, Detection]]:
+    """Keep the best of regions that overlap; the best first."""
+    kept: list[tuple[SmallTarget, Detection]] = []
+    for target, detection in sorted(found, key=lambda pair: -pair[1].score):
+        if not any(share(target, other) for other, _ in kept):
+            kept.append((target, detection))
+    return kept
