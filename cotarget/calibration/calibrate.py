@@ -22,17 +22,7 @@ from cotarget.calibration.captures import NO_IMAGE, CaptureIndex, pair_photos, r
 from cotarget.calibration.corners import another_board, find_corners, guess_corners
 from cotarget.calibration.file import Calibration
 from cotarget.calibration.initialization import FEWEST_CORNERS, sequential
-from cotarget.calibration.joint import (
-    NO_PLACE,
-    SAME_FOCAL,
-    fewest_stops,
-    find_expected,
-    fit_stop,
-    joint,
-    same_focal,
-    stops_of,
-    with_stop,
-)
+from cotarget.calibration.joint import NO_PLACE, joint
 from cotarget.calibration.model import (
     CAMERAS,
     DEFAULT_OPTIONS,
@@ -46,6 +36,15 @@ from cotarget.calibration.model import (
 )
 from cotarget.calibration.recorder import CaptureRecorder, with_stills
 from cotarget.calibration.session import capture_session
+from cotarget.calibration.zoom_samples import (
+    SAME_FOCAL,
+    fewest_stops,
+    find_expected,
+    fit_stop,
+    same_focal,
+    stops_of,
+    with_stop,
+)
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array

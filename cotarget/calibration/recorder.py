@@ -23,9 +23,9 @@ from cotarget.calibration.captures import (
     write_session,
 )
 from cotarget.calibration.corners import find_corners
-from cotarget.calibration.joint import same_focal
 from cotarget.calibration.model import CameraName, Capture, Rejected, View, unseen
 from cotarget.calibration.planning import Coverage
+from cotarget.calibration.zoom_samples import same_focal
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, HaltedError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, Rotation, pose_dict

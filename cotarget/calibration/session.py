@@ -26,17 +26,6 @@ from cotarget.calibration.bundle import Block, Fit, fit
 from cotarget.calibration.corners import smallest_spacing
 from cotarget.calibration.handeye import motions, park_martin
 from cotarget.calibration.initialization import board_pose, of_both, place_boards, pose_candidates, rough_intrinsics
-from cotarget.calibration.joint import (
-    FEWEST_CORNERS,
-    FEWEST_STOP_PLACEMENTS,
-    SAME_FOCAL,
-    expected_inside,
-    find_expected,
-    fit_stop,
-    same_focal,
-    spread_stops,
-    with_stop,
-)
 from cotarget.calibration.model import BundleModel, CameraName, Rejected, View
 from cotarget.calibration.observability import FARTHER
 from cotarget.calibration.planning import (
@@ -55,6 +44,17 @@ from cotarget.calibration.planning import (
     where_in,
 )
 from cotarget.calibration.recorder import CaptureRecorder
+from cotarget.calibration.zoom_samples import (
+    FEWEST_CORNERS,
+    FEWEST_STOP_PLACEMENTS,
+    SAME_FOCAL,
+    expected_inside,
+    find_expected,
+    fit_stop,
+    same_focal,
+    spread_stops,
+    with_stop,
+)
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError, ConfigError, CotargetError
 from cotarget.geometry import RigidTransform, Rotation

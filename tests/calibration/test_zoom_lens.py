@@ -9,7 +9,7 @@ import pytest
 
 from cotarget.calibration import Options, captures, predicted_pointing
 from cotarget.calibration.calibrate import calibrate, find_views
-from cotarget.calibration.joint import with_stop
+from cotarget.calibration.zoom_samples import with_stop
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.geometry import RigidTransform
