@@ -12,19 +12,20 @@ range r, where
 `solve` solves this for pan, tilt and r. Its closed form is exact for any eps where dz = 0. For dz != 0 the range
 depends on the tilt: a few rounds of the closed form come close, and Newton's method removes the rest.
 
-The inverse is written by coordinates, once for floats and arrays, because an array of one target takes twenty times as
-long as floats.
+The inverse is written by coordinates, in floats, because an array of one target takes twenty times as long.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import cv2
 import numpy as np
 
 from cotarget.errors import UnreachableError
 from cotarget.geometry import Array, RigidTransform, Rotation
+
+Angle = TypeVar("Angle", float, Array)
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class HeadGeometry:
             self.tilt_scale * np.asarray(tilt, float) + self.tilt_zero,
         )
 
-    def reported_angles(self, pan: Array, tilt: Array) -> tuple[Array, Array]:
+    def reported_angles(self, pan: Angle, tilt: Angle) -> tuple[Angle, Angle]:
         """Convert true pan and tilt to the angles that the head reports [rad]."""
         return (pan - self.pan_zero) / self.pan_scale, (tilt - self.tilt_zero) / self.tilt_scale
 
@@ -150,8 +151,7 @@ LONGEST_STEP = 0.2
 SINGULAR = np.finfo(float).tiny
 TURN = 2.0 * np.pi
 NOWHERE = (math.nan, math.nan, math.nan)
-V = TypeVar("V")
-Triple = tuple[V, V, V]
+Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -195,19 +195,16 @@ def solve(
         forward. All three are nan in a branch that does not exist, such as for a target nearer than the lever arm.
         Within half a degree of the pan axis, where the branches meet, both may be the same solution.
     """
-    x_base, ray = np.asarray(x_base, float), np.asarray(ray, float)
+    x_base, ray = np.broadcast_arrays(np.asarray(x_base, float), np.asarray(ray, float))
     T = T_head_zoom.as_matrix()
     R, t = T[:3, :3], T[:3, 3] + T[:3, 2] * pupil
     t[2] -= head.axis_offset
-    if x_base.ndim == ray.ndim == 1:
-        x, d = _floats(x_base), _floats(R @ ray / math.hypot(*ray))
-        ways = [_reported(*way, head) if way[2] > 0 else NOWHERE for way in _solve_one(x, d, _floats(t), head)]
-        return Pointing(*np.array(ways).T)
-    x_base, ray = np.broadcast_arrays(x_base, ray)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        d_many = ray / np.linalg.norm(ray, axis=-1, keepdims=True) @ R.T
-        found = _solve_many(x_base, d_many, t, head)
-    return Pointing(*(np.where(found[2] > 0, value, np.nan) for value in _reported(*found, head)))
+    ways: list[Triple] = []
+    for x, d in zip(x_base.reshape(-1, 3), ray.reshape(-1, 3), strict=True):
+        for *angles, reach in _solve_one(_floats(x), _floats(R @ d / math.hypot(*d)), _floats(t), head):
+            pan, tilt = head.reported_angles(*((angle + math.pi) % TURN - math.pi for angle in angles))
+            ways.append((pan, tilt, reach) if reach > 0 else NOWHERE)
+    return Pointing(*np.moveaxis(np.reshape(ways, (*x_base.shape[:-1], 2, 3)), -1, 0))
 
 
 def nearest(
@@ -254,24 +251,18 @@ def nearest(
     )
 
 
-def _reported(pan: Any, tilt: Any, reach: Any, head: HeadGeometry) -> Triple[Any]:
-    """Wrap true angles to -pi..pi and convert them to reported ones; the range stays. For floats or arrays."""
-    pan, tilt = head.reported_angles((pan + math.pi) % TURN - math.pi, (tilt + math.pi) % TURN - math.pi)
-    return pan, tilt, reach
-
-
-def _floats(v: Array) -> Triple[float]:
+def _floats(v: Array) -> Triple:
     x, y, z = v.tolist()
     return x, y, z
 
 
-def _solve_one(target: Triple[float], d: Triple[float], t: Triple[float], head: HeadGeometry) -> list[Triple[float]]:
+def _solve_one(target: Triple, d: Triple, t: Triple, head: HeadGeometry) -> list[Triple]:
     """Solve true pan, true tilt and range of one target in both branches; nan where a branch has no solution."""
     distance = math.hypot(*target)
     found = []
     for sign in (1.0, -1.0):
         try:
-            pan, tilt, reach = _closed_form(target, d, t, sign, head, math)
+            pan, tilt, reach = _closed_form(target, d, t, sign, head)
         except ValueError:  # math.sqrt of a negative number: the target is nearer than the lever arm
             found.append(NOWHERE)
             continue
@@ -289,41 +280,12 @@ def _solve_one(target: Triple[float], d: Triple[float], t: Triple[float], head: 
     return found
 
 
-def _solve_many(x_base: Array, d: Array, t: Array, head: HeadGeometry) -> Triple[Array]:
-    """Solve true pan, tilt and range, each (..., 2), of targets (..., 3) on rays d (..., 3), as `_solve_one` does."""
-    target, d = (
-        np.array(np.broadcast_to(v[..., None, :], (*v.shape[:-1], 2, 3))).reshape(-1, 3).T for v in (x_base, d)
-    )
-    distance = np.linalg.norm(target, axis=0)
-    sign = np.tile([1.0, -1.0], len(distance) // 2)
-    (x, y, z), (d_x, d_y, d_z), (t_x, t_y, t_z) = target, d, t
-    unknowns = np.array(_closed_form((x, y, z), (d_x, d_y, d_z), (t_x, t_y, t_z), sign, head, np))
-    error = np.full(len(distance), np.inf)
-    active = np.arange(len(distance))
-    for _ in range(NEWTON_STEPS):
-        pan, tilt, reach = unknowns[:, active]
-        turns = np.cos(pan), np.sin(pan), np.cos(tilt), np.sin(tilt)
-        residual, det, steps = _newton_step(*turns, reach, tuple(target[:, active]), tuple(d[:, active]), t, head)
-        error[active] = np.linalg.norm(residual, axis=0)
-        # Where the Jacobian is singular (a target on the pan axis), the iteration ends and the last check decides.
-        going_on = (error[active] > ROUNDING * distance[active]) & (np.abs(det) > SINGULAR)
-        active = active[going_on]
-        if not len(active):
-            break
-        step = np.array(steps)[:, going_on] / det[going_on]
-        longest = np.max(np.abs(step[:2]), axis=0)
-        unknowns[:, active] -= step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, LONGEST_STEP))
-    unknowns[:, ~(error <= ACCEPTED_MISS * distance)] = np.nan
-    pan, tilt, reach = unknowns.reshape(3, *x_base.shape[:-1], 2)
-    return pan, tilt, reach
-
-
-def _closed_form(target: Triple[Any], d: Triple[Any], t: Triple[Any], sign: Any, head: HeadGeometry, lib: Any) -> Any:
-    """Compute true pan, true tilt and range in closed form: (13) and (16) with atan2, for floats or arrays.
+def _closed_form(target: Triple, d: Triple, t: Triple, sign: float, head: HeadGeometry) -> Triple:
+    """Compute true pan, true tilt and range in closed form: (13) and (16) with atan2.
 
     The ray d has length 1, and t is the zoom camera's position from the tilt axis, both in the head's frame. The sign
-    is 1 for the branch that faces forward, -1 for the other; ``lib`` is `math` or `numpy`. The result is exact for
-    dz = 0. For dz != 0 the range depends on the tilt and both are iterated.
+    is 1 for the branch that faces forward, -1 for the other. The result is exact for dz = 0. For dz != 0 the range
+    depends on the tilt and both are iterated.
     """
     (a, b, c), dz = target, head.axis_offset
     sin_eps, cos_eps = math.sin(head.squareness), math.cos(head.squareness)
@@ -332,21 +294,21 @@ def _closed_form(target: Triple[Any], d: Triple[Any], t: Triple[Any], sign: Any,
     ahead = 0.0  # z of q after tilting
     for _ in range(1 if dz == 0 else CLOSED_FORM_ROUNDS):
         # |x_base|^2 = dz^2 + 2 dz z_tilted + |q|^2 with q = r d + t: a quadratic in the range r
-        reach = lib.sqrt(along * along + free - 2 * dz * ahead) - along
+        reach = math.sqrt(along * along + free - 2 * dz * ahead) - along
         qx, qy, qz = reach * d[0] + t[0], reach * d[1] + t[1], reach * d[2] + t[2]
         on_axis = cos_eps * qx + sin_eps * qy
         y, z, height = qy - on_axis * sin_eps, cos_eps * qz, b - on_axis * sin_eps
         left = y * y + z * z - height * height
-        tilt = lib.atan2(y, z) - lib.atan2(height, sign * lib.sqrt((left + abs(left)) / 2))  # (13)
-        x, _, ahead = _tilt((qx, qy, qz), lib.cos(tilt), lib.sin(tilt), head)  # (14)
+        tilt = math.atan2(y, z) - math.atan2(height, sign * math.sqrt((left + abs(left)) / 2))  # (13)
+        x, _, ahead = _tilt((qx, qy, qz), math.cos(tilt), math.sin(tilt), head)  # (14)
     z2 = ahead + dz
-    return lib.atan2(a * z2 - c * x, a * x + c * z2), tilt, reach  # (16)
+    return math.atan2(a * z2 - c * x, a * x + c * z2), tilt, reach  # (16)
 
 
 def _newton_step(
-    cos_pan: Any, sin_pan: Any, cos_tilt: Any, sin_tilt: Any, reach: Any,
-    target: Triple[Any], d: Triple[Any], t: Triple[Any] | Array, head: HeadGeometry,
-) -> tuple[Triple[Any], Any, Triple[Any]]:  # fmt: skip
+    cos_pan: float, sin_pan: float, cos_tilt: float, sin_tilt: float, reach: float,
+    target: Triple, d: Triple, t: Triple, head: HeadGeometry,
+) -> tuple[Triple, float, Triple]:  # fmt: skip
     """Compute the residual of Eq. 5 [m], the determinant of its Jacobian, and Newton's step times that determinant.
 
     The unknowns are (pan, tilt, range); the step is by Cramer's rule. All vectors are turned back by pan, which changes
@@ -361,12 +323,12 @@ def _newton_step(
     return residual, _det(by_pan, by_tilt, by_reach), steps
 
 
-def _pan(v: Triple[Any], cos: Any, sin: Any) -> Triple[Any]:
+def _pan(v: Triple, cos: float, sin: float) -> Triple:
     """Rotate a vector about Y, given the cosine and sine of pan."""
     return cos * v[0] + sin * v[2], v[1], cos * v[2] - sin * v[0]
 
 
-def _tilt(v: Triple[Any], cos: Any, sin: Any, head: HeadGeometry) -> Triple[Any]:
+def _tilt(v: Triple, cos: float, sin: float, head: HeadGeometry) -> Triple:
     """Rotate a vector about the tilt axis (Rodrigues), given the cosine and sine of tilt."""
     x_axis, y_axis = math.cos(head.squareness), math.sin(head.squareness)
     x, y, z = _about_tilt_axis(v, head)
@@ -374,13 +336,13 @@ def _tilt(v: Triple[Any], cos: Any, sin: Any, head: HeadGeometry) -> Triple[Any]
     return cos * v[0] + sin * x + along * x_axis, cos * v[1] + sin * y + along * y_axis, cos * v[2] + sin * z
 
 
-def _about_tilt_axis(v: Triple[Any], head: HeadGeometry) -> Triple[Any]:
+def _about_tilt_axis(v: Triple, head: HeadGeometry) -> Triple:
     """Compute the cross product of the tilt axis with a vector."""
     x_axis, y_axis = math.cos(head.squareness), math.sin(head.squareness)
     return y_axis * v[2], -x_axis * v[2], x_axis * v[1] - y_axis * v[0]
 
 
-def _det(a: Triple[Any], b: Triple[Any], c: Triple[Any]) -> Any:
+def _det(a: Triple, b: Triple, c: Triple) -> float:
     """Compute the determinant of three columns."""
     return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
 

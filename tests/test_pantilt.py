@@ -8,7 +8,7 @@ from cotarget.errors import UnreachableError
 from cotarget.geometry import angle_between, pose
 from cotarget.pantilt import HeadGeometry, base_head, nearest, shortcut, solve, towards
 
-RIGS, TARGETS = 500, 200  # 100,000 targets
+RIGS, TARGETS = 100, 200  # 20,000 targets
 MISS_DEG = 1e-9  # the figure to reach
 ROUNDING = 1e-12
 SAME_ANGLES = 1e-7  # [rad]; near the pan axis the angles are ill-conditioned though the aim is not
@@ -87,8 +87,8 @@ def test_inverse_hits_random_targets_in_both_branches():
     assert found >= MADE_FROM_FOUND * RIGS * TARGETS
 
 
-def test_solve_of_one_target_equals_that_of_many():
-    """Targets too near to be reached, on the pan axis and anywhere else, with a pupil that has moved."""
+def test_a_pupil_that_has_moved_is_a_camera_that_has():
+    """Of one target and of many: too near to be reached, on the pan axis and anywhere else."""
     rng = np.random.default_rng(3)
     for _ in range(100):
         T, head = random_rig(rng)
