@@ -2,7 +2,8 @@
 
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class CotargetError(Exception):
@@ -39,6 +40,15 @@ class EmergencyStopError(DeviceError):
 
 class UnreachableError(CotargetError):
     """No pan and tilt within the limits bring the target to the wanted pixel."""
+
+
+@contextmanager
+def naming(where: object) -> Iterator[None]:
+    """Put the name of a file or an option, if there is one, in front of the message of a wrong file or argument."""
+    try:
+        yield
+    except (ConfigError, CalibrationError) as error:
+        raise type(error)(f"{where}: {error}" if where else str(error)) from None
 
 
 def choices(names: Iterable[str]) -> str:

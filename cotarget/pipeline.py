@@ -22,7 +22,7 @@ from cotarget.control.selection import FirstCome, TargetSelector, candidates_of
 from cotarget.control.zoom import ZoomSettings, is_seen_well, shape_of
 from cotarget.detection import Detection, Detections, Detector, make_detector
 from cotarget.detection.base import flood
-from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices
+from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices, naming
 from cotarget.estimation import Estimate, FilterSettings
 from cotarget.estimation.zoom_matching import MatchingSettings, ZoomMeasurement
 from cotarget.fusion import FusionSettings, MakeFinder, TargetFusion, ZoomSearch
@@ -35,6 +35,7 @@ from cotarget.rig import (
     Image,
     PanTiltState,
     Rig,
+    RigSpec,
     ZoomState,
     check_shown,
     opened_from,
@@ -322,30 +323,73 @@ def follow(
         selector: selects the track to follow; by default the first that comes.
         seconds: duration on the rig's clock [s]; without an end by default.
         settings: settings of the run.
-        insist: whether to accept an implausible calibration or target profile, see `check_plausible` and
-            `target_implausibility`.
+        insist: whether to accept an implausible calibration or target profile, see `check_run`.
 
     Raises:
-        CalibrationError: the calibration has no T, or is implausible or another rig's.
-        ConfigError: the target is unknown or implausible, the simulated scene lacks it, the rig has no configuration to
-            take it from, the calibration has another aspect ratio than the rig's streams, or an argument has the wrong
-            type.
+        CalibrationError: see `check_run`.
+        ConfigError: see `check_run`; or the target is unknown, the rig has no configuration to take it from, or an
+            argument has the wrong type.
         StaleFrameError: frames of the fixed camera stopped coming, came too late to act on, or repeated; or the zoom
             camera showed nothing new for 10 s. Until then the run goes on without it, and every Step says so.
         DeviceError: a device failed, or its frames changed their size.
     """
     _check_seconds(seconds)
-    calibration.zoom_head.hand_eye()  # raises with the first step, not when the first target is seen
-    check_plausible(calibration, rig.spec, insist=insist)
-    name, wanted = _profile(rig, target)
-    if not insist and (text := target_implausibility(wanted, calibration, rig.spec, name)):
-        raise ConfigError(f"{text}; insist=True follows it all the same")
+    name, profile = _profile(rig, target)
+    check_run(calibration, rig.spec, profile, name, insist=insist)
+    yield from run_steps(rig, calibration, profile, detector, selector=selector, seconds=seconds, settings=settings)
+
+
+def check_run(
+    calibration: Calibration,
+    spec: RigSpec,
+    target: TargetProfile,
+    name: str = "",
+    *,
+    insist: bool = False,
+    files: tuple[object, object] = ("calibration", ""),
+) -> None:
+    """Refuse to follow with a calibration or a target that cannot be meant on a rig.
+
+    Args:
+        calibration: calibration of the rig.
+        spec: the rig, open or as its configuration describes it.
+        target: target profile.
+        name: its name in the rig's configuration; empty where it has none.
+        insist: whether to accept an implausible calibration or target profile.
+        files: what messages call the calibration and the configuration.
+
+    Raises:
+        CalibrationError: the calibration has no T, or is implausible or another rig's.
+        ConfigError: the calibration has another aspect ratio than the rig's streams, the simulated scene lacks the
+            target, or its profile is implausible.
+    """
+    file, rig = files
+    with naming(file):
+        calibration.zoom_head.hand_eye()
+        calibration.for_streams(spec.fixed.size, spec.zoom.size)
+    check_plausible(calibration, spec, insist=insist, where=file)
+    with naming(rig):
+        if name:
+            check_shown(spec, name)
+        if not insist and (text := target_implausibility(target, calibration, spec, name)):
+            raise ConfigError(f"{text}; insist=True follows it all the same")
+
+
+def run_steps(
+    rig: Rig,
+    calibration: Calibration,
+    target: TargetProfile,
+    detector: Detector | None = None,
+    *,
+    selector: TargetSelector | None = None,
+    seconds: float = math.inf,
+    settings: FollowSettings | None = None,
+) -> Iterator[Step]:
+    """Yield the steps of a run that `check_run` has let pass; the arguments are those of `follow`."""
     if detector is None:
-        detector = make_detector(wanted, rig.spec.fixed.rate_hz)
-    if settings is None:
-        settings = FollowSettings()
+        detector = make_detector(target, rig.spec.fixed.rate_hz)
     fitting = calibration.for_streams(rig.fixed.size, rig.zoom.size)
-    run = _Run(rig, fitting, wanted, detector, selector or FirstCome(), settings)
+    run = _Run(rig, fitting, target, detector, selector or FirstCome(), settings or FollowSettings())
     end = rig.clock.now() + seconds
     while rig.clock.now() < end:
         yield run.step()
@@ -360,7 +404,7 @@ def _profile(rig: Rig, target: TargetProfile | str) -> tuple[str, TargetProfile]
     """Return the name, empty where it has none, and the profile of a target.
 
     Raises:
-        ConfigError: it is none, is unknown, or is not in the simulated scene.
+        ConfigError: it is none, or is unknown.
     """
     if isinstance(target, TargetProfile):
         return "", target
@@ -369,9 +413,7 @@ def _profile(rig: Rig, target: TargetProfile | str) -> tuple[str, TargetProfile]
         raise ConfigError(
             f"follow: target is {target!r}; give a TargetProfile or one name, of: {choices(config.targets)}"
         )
-    profile = config.target(target)
-    check_shown(rig.spec, target)
-    return target, profile
+    return target, config.target(target)
 
 
 def _joined(reasons: Iterable[str]) -> str:

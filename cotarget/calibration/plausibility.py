@@ -41,15 +41,17 @@ CHECKED_PLACEMENTS = 5  # placements whose views are predicted
 OTHER_LENS = 1.25  # ratio of focal lengths beyond which a lens is another one
 
 
-def check_plausible(calibration: Calibration, spec: RigSpec | None = None, *, insist: bool = False) -> None:
+def check_plausible(
+    calibration: Calibration, spec: RigSpec | None = None, *, insist: bool = False, where: object = "calibration"
+) -> None:
     """Refuse a calibration that no rig has, or that belongs to another rig than the one in use; accept it on insist.
 
     Raises:
-        CalibrationError: it is implausible; the message names the key in calibration.json.
+        CalibrationError: it is implausible; the message names ``where`` it is from, and the key in calibration.json.
         ConfigError: a stream has another aspect ratio than that calibrated.
     """
     if not insist and (text := implausibility(calibration, spec)):
-        raise CalibrationError(f"calibration: {text}; insist=True uses it all the same")
+        raise CalibrationError(f"{where}: {text}; insist=True uses it all the same")
 
 
 def implausibility(calibration: Calibration, spec: RigSpec | None = None) -> str:

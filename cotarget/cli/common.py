@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.errors import CalibrationError, ConfigError
+from cotarget.errors import ConfigError, naming
 from cotarget.files import STDOUT, behind_link, write_atomically
 
 if TYPE_CHECKING:
@@ -26,26 +26,16 @@ if TYPE_CHECKING:
     from cotarget.track_metrics import Criterion, Label, Tracked
 
 
-@contextmanager
-def naming(where: object) -> Iterator[None]:
-    """Put the name of a file or an option in front of the message of a ConfigError."""
-    try:
-        yield
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
-
-
 def load_plausible(path: Path, spec: "RigSpec | None" = None, *, insist: bool) -> "Calibration":
     """Load a calibration; refuse one that is implausible, by itself or for a rig, unless the user insists."""
     from cotarget.calibration import Calibration
-    from cotarget.calibration.plausibility import implausibility
+    from cotarget.calibration.plausibility import check_plausible
 
     calibration = Calibration.load(path)
     if spec is not None:
         with naming(path):
             calibration.for_streams(spec.fixed.size, spec.zoom.size)
-    if not insist and (text := implausibility(calibration, spec)):
-        raise CalibrationError(f"{path}: {text}; --insist uses it all the same")
+    check_plausible(calibration, spec, insist=insist, where=path)
     return calibration
 
 

@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from cotarget.cli.common import (
     check_outputs,
-    load_plausible,
-    naming,
     number,
     open_named,
     print_json,
@@ -28,7 +26,7 @@ from cotarget.cli.common import (
     scores_of,
     whole,
 )
-from cotarget.errors import ConfigError, choices
+from cotarget.errors import ConfigError, choices, naming
 from cotarget.files import STDOUT, CsvFile
 
 if TYPE_CHECKING:
@@ -43,23 +41,20 @@ if TYPE_CHECKING:
 def follow_command(options: argparse.Namespace) -> int:
     """Run `cotarget follow`: follow a target with the rig, and record it on request; return the exit status."""
     from cotarget.backends import describe, load_config
+    from cotarget.calibration import Calibration
+    from cotarget.pipeline import check_run
     from cotarget.recording.recorder import Recorder
-    from cotarget.rig import check_shown
     from cotarget.safety.safe_rig import guard
     from cotarget.safety.stop_file import refuse_if_stopped
-    from cotarget.targeting import target_implausibility
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
     with naming("--target"):
         target = config.target(options.target)  # an unknown one is refused before the long work
-    spec = describe(config)
-    calibration = load_plausible(options.calibration, spec, insist=options.insist)
-    with naming(options.rig):
-        check_shown(spec, options.target)
+    spec, calibration = describe(config), Calibration.load(options.calibration)
+    files = options.calibration, options.rig
     check_outputs(_files(options), [*rig_files(options.rig, config), options.calibration], options.record)
-    if not options.insist and (text := target_implausibility(target, calibration, spec, options.target)):
-        raise ConfigError(f"{options.rig}: {text}; --insist follows it all the same")
+    check_run(calibration, spec, target, options.target, insist=options.insist, files=files)
     selection, rate_hz = Selection(options, spec.fixed.size), spec.fixed.rate_hz
     seconds = math.inf if options.seconds is None else options.seconds
     with (
@@ -187,7 +182,7 @@ def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
     """
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
-    from cotarget.pipeline import follow
+    from cotarget.pipeline import run_steps
     from cotarget.recording.recorder import COLUMNS, step_row, utc_text
     from cotarget.recording.replay import until_end
     from cotarget.safety.signals import deferred_signals
@@ -211,8 +206,7 @@ def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
             if film is not None:
                 film.epoch = epoch
             selector = run.selection.selector
-            # insist: `follow` has checked calibration and target, and a replay takes those of the recorded run.
-            steps = follow(rig, run.calibration, target, detector, selector=selector, seconds=run.seconds, insist=True)
+            steps = run_steps(rig, run.calibration, target, detector, selector=selector, seconds=run.seconds)
             try:
                 for step in until_end(steps, run.replay):
                     with deferred_signals():  # table, counts and film have the same steps

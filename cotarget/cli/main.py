@@ -102,7 +102,7 @@ def _run(options: argparse.Namespace) -> int:
         sys.stdout.flush()
         return status
     except CotargetError as error:
-        text = str(error)
+        text = str(error).replace("insist=True", "--insist")
         if getattr(options, "rig", None) is not None:  # the safety layer does not know the file's name
             text = text.replace("--rig FILE", f"--rig {options.rig}")
         _print_end(options.command, text, error)

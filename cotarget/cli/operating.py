@@ -13,13 +13,12 @@ from cotarget.cli.common import (
     check_outputs,
     check_within,
     load_plausible,
-    naming,
     open_named,
     previous_kept,
     print_json,
     rig_files,
 )
-from cotarget.errors import CalibrationError, ConfigError, DeviceError
+from cotarget.errors import CalibrationError, ConfigError, DeviceError, naming
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
     check_outputs,
-    load_plausible,
-    naming,
     previous_kept,
     print_json,
     progress_bar,
@@ -22,7 +20,7 @@ from cotarget.cli.common import (
     warn_shortfall,
     warn_unscored,
 )
-from cotarget.errors import ConfigError
+from cotarget.errors import ConfigError, naming
 from cotarget.files import STDOUT
 
 if TYPE_CHECKING:
@@ -43,7 +41,9 @@ TARGETS = ("person", "bird")  # targets of the scene without --rig and --target
 
 def view_command(options: argparse.Namespace) -> None:
     """Run `cotarget view`: show the simulated scene, with the pipeline at work where a target is named."""
-    from cotarget.backends import describe
+    from cotarget.calibration import Calibration
+    from cotarget.evaluation import true_calibration
+    from cotarget.pipeline import check_run
     from cotarget.sim.world import SimWorld
 
     if options.port is not None and not options.browser:
@@ -51,12 +51,13 @@ def view_command(options: argparse.Namespace) -> None:
     if options.calibration is not None and options.target is None:
         raise ConfigError("--calibration: needs --target NAME, the target to follow")
     config = _config(options)
-    calibration = None
-    if options.calibration is not None:
-        calibration = load_plausible(options.calibration, describe(config), insist=options.insist)
+    calibration = None if options.calibration is None else Calibration.load(options.calibration)
     opened = window_opener(options)  # called first, because making the world takes a while
-    world = SimWorld(config)
-    with closing(world), closing(opened(world.truth())) as window:
+    with closing(SimWorld(config)) as world, closing(opened(world.truth())) as window:
+        if options.target is not None:
+            calibration = calibration or true_calibration(world)
+            files, target = (options.calibration or "calibration", options.rig or ""), config.target(options.target)
+            check_run(calibration, world.rig.spec, target, options.target, insist=options.insist, files=files)
         print(f"{window.where} shows the scene; Ctrl-C ends it", file=sys.stderr, flush=True)
         try:
             seconds = math.inf if options.seconds is None else options.seconds
@@ -91,10 +92,9 @@ def watch(
 
 def _config(options: argparse.Namespace) -> "RigConfig":
     """Load or make the configuration of the rig to view."""
-    from cotarget.backends import describe, load_config
+    from cotarget.backends import load_config
     from cotarget.config import RigConfig
     from cotarget.demo import SCENES, sim_config
-    from cotarget.rig import check_shown
 
     if options.rig is None:
         if options.target is not None:
@@ -108,8 +108,6 @@ def _config(options: argparse.Namespace) -> "RigConfig":
     if options.target is not None:
         with naming("--target"):
             config.target(options.target)
-        with naming(options.rig):
-            check_shown(describe(config), options.target)
     return config
 
 
@@ -128,15 +126,14 @@ def window_opener(options: argparse.Namespace) -> "Callable[[Truth], Any]":
 def _snapshots(
     options: argparse.Namespace, config: "RigConfig", world: "SimWorld", calibration: "Calibration | None"
 ) -> "Iterator[Snapshot]":
-    """Yield snapshots of the pipeline following a target, or of the rig at rest."""
-    from cotarget.evaluation import true_calibration
+    """Yield snapshots of the pipeline following a target, or of the rig at rest without a calibration."""
     from cotarget.safety.safe_rig import guard
 
     with guard(world.rig, config.safety) as rig:
-        if options.target is None:
+        if calibration is None:
             yield from _at_rest(rig, world.truth())
         else:
-            yield from _followed(options, config, calibration or true_calibration(world), world, rig)
+            yield from _followed(options, config, calibration, world, rig)
 
 
 def _at_rest(rig: "Rig", truth: "Truth") -> "Iterator[Snapshot]":
@@ -154,15 +151,11 @@ def _followed(
     options: argparse.Namespace, config: "RigConfig", calibration: "Calibration", world: "SimWorld", rig: "Rig"
 ) -> "Iterator[Snapshot]":
     from cotarget.drawing import draw_wide, draw_zoom
-    from cotarget.pipeline import follow
+    from cotarget.pipeline import run_steps
     from cotarget.sim.viewer.scene import Snapshot, frusta_of
-    from cotarget.targeting import target_implausibility
 
     truth, name = world.truth(), options.target
-    target = config.target(name)
-    if not options.insist and (text := target_implausibility(target, calibration, rig.spec, name)):
-        raise ConfigError(f"{options.rig}: {text}; --insist follows it all the same")
-    for step in follow(rig, calibration, target, insist=True):
+    for step in run_steps(rig, calibration, config.target(name)):
         depths = {} if step.aim is None else {"zoom": step.aim.range}
         caption = f"t = {step.t:.1f} s   {name}: {step.state}"
         pictures = {"fixed": draw_wide(step), "zoom": draw_zoom(step)}

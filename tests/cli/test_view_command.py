@@ -132,6 +132,13 @@ def test_view_shows_the_rig_at_rest_or_the_pipeline(tmp_path, capsys, monkeypatc
     assert sights[-1].caption.endswith("book: searching" if target else f"{sights[-1].t:.1f} s")
 
 
+def test_view_refuses_a_target_that_follow_refuses(tmp_path, capsys, monkeypatch):
+    (tmp_path / "rig.toml").write_text('[sim]\ntargets = ["book"]\n[targets.book]\nsize = 23.4\n')
+    monkeypatch.setattr(running, "window_opener", lambda options: lambda truth: SimpleNamespace(close=int))
+    status, _, said = call(capsys, "view", "--rig", tmp_path / "rig.toml", "--target", "book")
+    assert (status, "rig.toml: targets.book.size: 23.4" in said, "--insist" in said) == (1, True, True)
+
+
 @pytest.fixture
 def unserved(monkeypatch):
     """A web viewer whose thread ends at once and which notes that it was closed."""

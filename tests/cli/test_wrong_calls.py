@@ -129,6 +129,7 @@ CALLS = [
     ("follow --calibration good.json --rig replay.toml --target book", FAILED, "none: "),
     ("follow --calibration good.json --rig of_nothing.toml --target book", FAILED, "of_nothing.toml: recording"),
     ("follow --calibration wide.json --rig rig.toml --target book", FAILED, "wide.json: ", "640x480", "640x360"),
+    ("follow --calibration headless.json --rig rig.toml --target book", FAILED, "headless.json: ", "T_head_zoom"),
     ("follow --calibration millimetres.json --rig rig.toml --target book", FAILED, POSE, "metres", "--insist"),
     ("follow --calibration good.json --rig house.toml --target book", FAILED, "targets.book.size: 23.4", "--insist"),
     (f"{FOLLOW} --seconds 0", USAGE, "--seconds"),
