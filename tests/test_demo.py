@@ -81,7 +81,7 @@ def test_the_summary_has_a_line_a_target_and_a_dash_for_a_missing_figure():
 
 def test_the_process_that_starts_the_runs_imports_nothing_large():
     """Its memory adds to that of each run."""
-    program = "import sys, cotarget.demo, cotarget.cli.running; print(*sys.modules)"
+    program = "import sys, cotarget.demo, cotarget.cli.demo; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=100)
     assert not {"numpy", "cv2", "mujoco", "matplotlib", "av"} & set(done.stdout.split())
 

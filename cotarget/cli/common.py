@@ -245,7 +245,25 @@ def _second_name(path: Path) -> Path | None:
     return kept
 
 
-# Values of options
+# Options that several commands have, and their values
+
+RIG = Path("rig.toml")  # the default of --rig
+BOARD_KINDS = ("chessboard", "charuco")
+
+
+def add_file(parser: argparse.ArgumentParser, name: str, about: str, metavar: str = "FILE", **more: Any) -> None:
+    """Add an option or argument that names a file or folder."""
+    parser.add_argument(name, type=Path, metavar=metavar, help=about, **more)
+
+
+def add_rig(parser: argparse.ArgumentParser) -> None:
+    """Add --rig of a command that needs a rig."""
+    add_file(parser, "--rig", "rig.toml", required=True)
+
+
+def add_insist(parser: argparse.ArgumentParser) -> None:
+    """Add the option that accepts implausible values."""
+    parser.add_argument("--insist", action="store_true", help="accept what is far outside of anything plausible")
 
 
 def check_within(option: str, value: float, bounds: tuple[float, float], whose: str, slack: float = 0.0) -> None:

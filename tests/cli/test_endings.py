@@ -12,7 +12,7 @@ import pytest
 
 import cotarget.detect_video  # noqa: F401  # before the fixture replaces the detectors that it imports
 from cotarget.backends import OPENERS
-from cotarget.cli.following import FEW, MANY, LensAtItsEnd, Reasons, StepCounts
+from cotarget.cli.pipeline_run import FEW, MANY, LensAtItsEnd, Reasons, StepCounts
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.errors import DeviceError
 from cotarget.files import CsvFile

@@ -99,7 +99,7 @@ def sessions(folder, monkeypatch):
     rig = SimulatedDevices()
     rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, describe(RigConfig()).zoom.focal_range  # 12 x zoom
     monkeypatch.setitem(OPENERS, "sim", lambda config, file: rig_of(rig, config=config))
-    monkeypatch.setattr("cotarget.cli.calibrating.calibration_summary", lambda found, path: {"verdict": -0.0})
+    monkeypatch.setattr("cotarget.cli.calibrate.calibration_summary", lambda found, path: {"verdict": -0.0})
     return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", Session(error))
 
 

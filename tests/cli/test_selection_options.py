@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cotarget.cli.following import Selection, add_selection
+from cotarget.cli.pipeline_run import Selection, add_selection
 from cotarget.control.selection import Candidate
 from cotarget.rig import PanTiltLimits
 from cotarget.tracking.track import Track

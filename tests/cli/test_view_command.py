@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.cli import running
+from cotarget.cli import view
 from cotarget.config import RigConfig, SimConfig
 from cotarget.errors import DeviceError
 from cotarget.sim.render.opengl import mujoco
@@ -98,7 +98,7 @@ def moments(clock, took):
 def test_snapshots_are_shown_in_real_time_without_catching_up():
     clock = WallClock()
     window = Window(clock)
-    running.watch(moments(clock, [0.0, 0.02, 0.02, 0.5, 0.02]), window, clock.now, clock.sleep)
+    view.watch(moments(clock, [0.0, 0.02, 0.02, 0.5, 0.02]), window, clock.now, clock.sleep)
     np.testing.assert_allclose([at for _, at in window.shown], [0.0, 0.02, 0.12, 0.7, 0.72])
     np.testing.assert_allclose(clock.now(), 0.8)
 
@@ -121,8 +121,8 @@ def test_view_shows_the_rig_at_rest_or_the_pipeline(tmp_path, capsys, monkeypatc
 
     black = SimWorld(RigConfig(sim=SimConfig(scene="indoor", targets=("book",))), rendered=())
     monkeypatch.setattr("cotarget.sim.world.SimWorld", lambda config: black)
-    monkeypatch.setattr(running, "window_opener", lambda options: lambda truth: Shown(clock))
-    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=clock.now, sleep=clock.sleep))
+    monkeypatch.setattr(view, "window_opener", lambda options: lambda truth: Shown(clock))
+    monkeypatch.setattr(view, "time", SimpleNamespace(monotonic=clock.now, sleep=clock.sleep))
     assert call(capsys, "view", "--rig", tmp_path / "rig.toml", "--seconds", "0.3", *target)[:2] == (0, "")
     *sights, end = shown
     assert end == "closed"
@@ -134,7 +134,7 @@ def test_view_shows_the_rig_at_rest_or_the_pipeline(tmp_path, capsys, monkeypatc
 
 def test_view_refuses_a_target_that_follow_refuses(tmp_path, capsys, monkeypatch):
     (tmp_path / "rig.toml").write_text('[sim]\ntargets = ["book"]\n[targets.book]\nsize = 23.4\n')
-    monkeypatch.setattr(running, "window_opener", lambda options: lambda truth: SimpleNamespace(close=int))
+    monkeypatch.setattr(view, "window_opener", lambda options: lambda truth: SimpleNamespace(close=int))
     status, _, said = call(capsys, "view", "--rig", tmp_path / "rig.toml", "--target", "book")
     assert (status, "rig.toml: targets.book.size: 23.4" in said, "--insist" in said) == (1, True, True)
 

@@ -13,7 +13,7 @@ import pytest
 
 from cotarget import cli
 from cotarget.calibration import Covariance, HeldOut, Options, Rejected, calibrate_views
-from cotarget.cli.calibrating import calibration_summary
+from cotarget.cli.calibrate import calibration_summary
 from cotarget.errors import CalibrationError
 from cotarget.report.analysis import (
     JITTER_GROUP,

@@ -1,4 +1,4 @@
-"""Commands for calibration: calibrate, report, board."""
+"""Calibrate from a rig, from saved captures, or from plain photos: `cotarget calibrate --captures captures`."""
 
 import argparse
 import contextlib
@@ -10,17 +10,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
+    BOARD_KINDS,
+    add_file,
+    board_corners,
     check_board_size,
     check_outputs,
-    load_plausible,
     open_named,
+    positive,
     previous_kept,
     print_json,
     progress_bar,
     rig_files,
+    whole,
 )
 from cotarget.errors import CalibrationError, ConfigError
-from cotarget.files import behind_link
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
@@ -31,8 +34,37 @@ LISTS = ("index.json", "session.json", "commands.jsonl")  # files beside the ima
 SESSION = ("placements", "stops")  # options of a capture session
 
 
-def calibrate_command(options: argparse.Namespace) -> None:
-    """Run `cotarget calibrate`: calibrate from a capture session, saved captures or photos, and print a summary."""
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml: drive that rig through a capture plan")
+    source.add_argument("--from", type=Path, metavar="DIR", dest="source", help="captures taken earlier, or photos")
+    about = "file to write (calibration.json); an earlier one is kept under another name"
+    add_file(parser, "--out", about, default=Path("calibration.json"))
+    add_file(parser, "--captures", "with --rig: keep the images in this folder", "DIR")
+    parser.add_argument("--fixed", metavar="GLOB", help="photos of the fixed camera, such as 'left*.jpg'")
+    about = "photos of the zoom camera, paired by the numbers in their names"
+    parser.add_argument("--zoom", metavar="GLOB", help=about)
+    about = "inner corners of the board, such as 9x6"
+    parser.add_argument("--board", type=board_corners, metavar="CxR", help=about)
+    parser.add_argument("--square", type=positive, metavar="M", help="side of a square [m]")
+    parser.add_argument("--kind", choices=BOARD_KINDS, help=f"kind of the board on photos ({BOARD_KINDS[0]})")
+    about = "with --rig: number of board placements at the shortest focal length, at least 7 (30)"
+    parser.add_argument("--placements", type=whole(1), metavar="N", help=about)
+    about = (
+        "with --rig: number of zoom samples, more where they are too far apart; 1: shortest alone, otherwise with "
+        "6 more placements far away (8)"
+    )
+    parser.add_argument("--stops", type=whole(1), metavar="N", help=about)
+    about = "one fit of everything, or the paper's step-by-step method (joint)"
+    parser.add_argument("--method", choices=("joint", "sequential"), default="joint", help=about)
+    parser.add_argument("--encoders", action="store_true", help="calibrate the encoders' scales and zeros too")
+    about = "go on where the motions leave something undetermined, with an uncertainty to match"
+    parser.add_argument("--insist", action="store_true", help=about)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Calibrate, write the calibration, and print a summary."""
     from cotarget import calibration as cal
     from cotarget.backends import load_config
     from cotarget.calibration.calibrate import calibrate as calibrate_rig
@@ -184,34 +216,3 @@ def calibration_summary(found: "Calibration", path: Path) -> dict[str, Any]:
             },
         }
     return table | {"verdict": judge(found).text, "calibration": str(path)}
-
-
-def report_command(options: argparse.Namespace) -> None:
-    """Run `cotarget report`: write the report page of a calibration."""
-    from cotarget.report.page import write_report
-
-    check_outputs([options.out], [options.calibration])
-    calibration = load_plausible(options.calibration, insist=options.insist)
-    page = behind_link(options.out)
-    print(write_report(page, calibration, options.calibration.name).text)
-    print(f"the page is {page}, and its pictures are in {page.stem}_pictures beside it")
-
-
-def board_command(options: argparse.Namespace) -> None:
-    """Run `cotarget board`: write a board to print."""
-    from cotarget.board import check_board, print_board
-    from cotarget.config import BoardConfig, check_square
-
-    check_outputs([options.out], [])
-    check_square(options.square, "--square")
-    made = BoardConfig(options.kind, options.board, options.square)
-    try:
-        check_board(made)
-    except ConfigError as error:
-        raise ConfigError(f"--board: {str(error).removeprefix('board.corners: ')}") from None
-    width, height = print_board(options.out, made)
-    print(
-        f"{options.out}: {1000 * width:.1f} x {1000 * height:.1f} mm with its white border; print it at 100 %, stick it"
-    )
-    print("on something flat, and measure ten squares before you trust it; what rig.toml has to say of it:")
-    print(f'[board]\nkind = "{options.kind}"\ncorners = {list(options.board)}\nsquare = {options.square:g}')

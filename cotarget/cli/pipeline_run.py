@@ -1,4 +1,4 @@
-"""Commands that run the pipeline on a rig: follow, and replay of a recording.
+"""A run of the pipeline with its table, film, summary and warnings, as follow and replay have it.
 
 Observers see every step of a run and warn at its end: `Selection`, `Reasons`, `StepCounts` and `LensAtItsEnd`.
 """
@@ -16,17 +16,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from cotarget.cli.common import (
-    check_outputs,
-    number,
-    open_named,
-    print_json,
-    progress_bar,
-    rig_files,
-    scores_of,
-    whole,
-)
-from cotarget.errors import ConfigError, choices, naming
+from cotarget.cli.common import add_file, number, progress_bar, whole
+from cotarget.errors import ConfigError, choices
 from cotarget.files import STDOUT, CsvFile
 
 if TYPE_CHECKING:
@@ -35,85 +26,15 @@ if TYPE_CHECKING:
     from cotarget.pipeline import Step
     from cotarget.recording.replay import Replay
     from cotarget.rig import Rig
-    from cotarget.track_metrics import Tracked
 
 
-def follow_command(options: argparse.Namespace) -> int:
-    """Run `cotarget follow`: follow a target with the rig, and record it on request; return the exit status."""
-    from cotarget.backends import describe, load_config
-    from cotarget.calibration import Calibration
-    from cotarget.pipeline import check_run
-    from cotarget.recording.recorder import Recorder
-    from cotarget.safety.safe_rig import guard
-    from cotarget.safety.stop_file import refuse_if_stopped
-
-    config = load_config(options.rig)
-    refuse_if_stopped(config.safety.stop_file)
-    with naming("--target"):
-        target = config.target(options.target)  # an unknown one is refused before the long work
-    spec, calibration = describe(config), Calibration.load(options.calibration)
-    files = options.calibration, options.rig
-    check_outputs(_files(options), [*rig_files(options.rig, config), options.calibration], options.record)
-    check_run(calibration, spec, target, options.target, insist=options.insist, files=files)
-    selection, rate_hz = Selection(options, spec.fixed.size), spec.fixed.rate_hz
-    seconds = math.inf if options.seconds is None else options.seconds
-    with (
-        Recorder(options.record, config, options.calibration, options.target, selection.selector)
-        if options.record
-        else nullcontext() as recorder
-    ):
-
-        def opened() -> "Rig":
-            rig = open_named(options.rig, config, guarded=False)
-            return guard(recorder.wrap(rig) if recorder else rig, config.safety)
-
-        expected = None if math.isinf(seconds) else math.ceil(seconds * rate_hz)
-        run = Run(opened, config, calibration, options.target, rate_hz, selection, seconds, expected)
-        result = _follow(run, options)
-        if result.interrupt is None:  # a run cut short may not have had the time to see anything
-            _hint_if_unseen("follow", run, result.counts)
-        print_json(result.table, options.csv)
-        if result.interrupt is not None:
-            raise result.interrupt
-    return result.counts.exit_status
+def add_outputs(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a run's table and video."""
+    add_file(parser, "--csv", "write one line a step; -: to stdout")
+    add_file(parser, "--video", "write a side-by-side video (.mp4)")
 
 
-def replay_command(options: argparse.Namespace) -> int:
-    """Run `cotarget replay`: run the pipeline on a recording and compare its commands; return the exit status."""
-    from cotarget.backends import open_recording
-    from cotarget.calibration import Calibration
-    from cotarget.recording.replay import Replay
-    from cotarget.safety.safe_rig import guard
-    from cotarget.track_metrics import read_labels
-
-    recording = open_recording(options.recording)
-    for note in recording.notes:
-        print(f"{options.recording}: {note}", file=sys.stderr)
-    calibration = Calibration.load(recording.calibration)
-    config, name, rate_hz = recording.config, recording.target, recording.spec.fixed.rate_hz
-    check_outputs(_files(options), [*rig_files(None, config), options.recording, options.labels])
-    labels = None if options.labels is None else read_labels(options.labels)
-    played, seen = Replay(recording), TracksByImage(recording.pictures)
-    selection = Selection(options, recording.spec.fixed.size, recording.selector_table)
-
-    def opened() -> "Rig":
-        return guard(played.rig, config.safety)
-
-    run = Run(opened, config, calibration, name, rate_hz, selection, math.inf, recording.steps, played)
-    result = _follow(run, options, seen)
-    if result.interrupt is not None:
-        raise result.interrupt
-    _hint_if_unseen("replay", run, result.counts)
-    frames = max(recording.pictures.values(), default=-1) + 1
-    scores = scores_of(options.labels, seen.tracks, labels, rate_hz, frames)
-    differences = played.differences
-    print_json(result.table | {"differences": dataclasses.asdict(differences)} | scores, options.csv)
-    if not differences.same:
-        print(f"cotarget replay: {differences}", file=sys.stderr)
-    return 1 if options.check and not differences.same else 0
-
-
-def _files(options: argparse.Namespace) -> list[Path | None]:
+def output_files(options: argparse.Namespace) -> list[Path | None]:
     """List the files that a run writes; a table may go to stdout instead."""
     return [None if options.csv == STDOUT else options.csv, options.video]
 
@@ -174,7 +95,7 @@ class Observer(Protocol):
         """One line on what was wrong in the run; empty if nothing was."""
 
 
-def _follow(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
+def run_observed(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
     """Follow a target with progress, table and film.
 
     However the run ends, the head is halted before the files are completed. Ctrl-C is the usual end of a run whose
@@ -250,7 +171,7 @@ NEEDED = {
 }
 
 
-def _hint_if_unseen(command: str, run: Run, counts: "StepCounts") -> None:
+def warn_if_unseen(command: str, run: Run, counts: "StepCounts") -> None:
     """Print a hint if no target was detected in the whole run."""
     if not counts.only_searched or run.selection.warning:
         return
@@ -359,27 +280,6 @@ class LensAtItsEnd:
             f"in {count} of {self._steps} frames the lens was at its end and could show the {self._name} only "
             f"{statistics.median(self._shown_px):.0f} px large, and not {self._target.wanted_px:g}"
         )
-
-
-class TracksByImage:
-    """The confirmed tracks of a replay, with the numbers of the recorded images, which are given by exposure time."""
-
-    warning = ""
-
-    def __init__(self, numbers: Mapping[float, int]) -> None:
-        self._numbers = numbers
-        self.tracks: list[Tracked] = []
-
-    def see(self, step: "Step") -> None:
-        """Collect the tracks of a step."""
-        from cotarget.track_metrics import Tracked
-
-        frame = self._numbers[step.fixed.t]
-        self.tracks += [
-            Tracked(each.center_px, each.size_px, frame, step.fixed.t, each.id)
-            for each in step.tracks
-            if each.confirmed
-        ]
 
 
 # Reasons of the steps

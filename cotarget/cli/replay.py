@@ -1,0 +1,91 @@
+"""Run the pipeline again on a recording of follow --record: `cotarget replay run1 --check`."""
+
+import argparse
+import dataclasses
+import math
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from cotarget.cli.common import add_file, check_outputs, print_json, rig_files, scores_of
+from cotarget.cli.pipeline_run import (
+    Run,
+    Selection,
+    add_outputs,
+    add_selection,
+    output_files,
+    run_observed,
+    warn_if_unseen,
+)
+
+if TYPE_CHECKING:
+    from cotarget.pipeline import Step
+    from cotarget.rig import Rig
+    from cotarget.track_metrics import Tracked
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_file(parser, "recording", "folder of the recording", "DIR")
+    add_selection(parser, "as in the recorded run")
+    about = "end with status 1 if the commands differ from the recorded ones"
+    parser.add_argument("--check", action="store_true", help=about)
+    about = "score the tracks by these labels: a csv as for detect, whose frame is the image number in DIR/fixed"
+    add_file(parser, "--labels", about)
+    add_outputs(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the pipeline on a recording and compare its commands; return the exit status."""
+    from cotarget.backends import open_recording
+    from cotarget.calibration import Calibration
+    from cotarget.recording.replay import Replay
+    from cotarget.safety.safe_rig import guard
+    from cotarget.track_metrics import read_labels
+
+    recording = open_recording(options.recording)
+    for note in recording.notes:
+        print(f"{options.recording}: {note}", file=sys.stderr)
+    calibration = Calibration.load(recording.calibration)
+    config, name, rate_hz = recording.config, recording.target, recording.spec.fixed.rate_hz
+    check_outputs(output_files(options), [*rig_files(None, config), options.recording, options.labels])
+    labels = None if options.labels is None else read_labels(options.labels)
+    played, seen = Replay(recording), TracksByImage(recording.pictures)
+    selection = Selection(options, recording.spec.fixed.size, recording.selector_table)
+
+    def opened() -> "Rig":
+        return guard(played.rig, config.safety)
+
+    run = Run(opened, config, calibration, name, rate_hz, selection, math.inf, recording.steps, played)
+    result = run_observed(run, options, seen)
+    if result.interrupt is not None:
+        raise result.interrupt
+    warn_if_unseen("replay", run, result.counts)
+    frames = max(recording.pictures.values(), default=-1) + 1
+    scores = scores_of(options.labels, seen.tracks, labels, rate_hz, frames)
+    differences = played.differences
+    print_json(result.table | {"differences": dataclasses.asdict(differences)} | scores, options.csv)
+    if not differences.same:
+        print(f"cotarget replay: {differences}", file=sys.stderr)
+    return 1 if options.check and not differences.same else 0
+
+
+class TracksByImage:
+    """The confirmed tracks of a replay, with the numbers of the recorded images, which are given by exposure time."""
+
+    warning = ""
+
+    def __init__(self, numbers: Mapping[float, int]) -> None:
+        self._numbers = numbers
+        self.tracks: list[Tracked] = []
+
+    def see(self, step: "Step") -> None:
+        """Collect the tracks of a step."""
+        from cotarget.track_metrics import Tracked
+
+        frame = self._numbers[step.fixed.t]
+        self.tracks += [
+            Tracked(each.center_px, each.size_px, frame, step.fixed.t, each.id)
+            for each in step.tracks
+            if each.confirmed
+        ]

@@ -1,0 +1,80 @@
+"""Let the pan-tilt head find its limits; it turns through its whole range: `cotarget reset-head`."""
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+from cotarget.cli.common import add_rig
+from cotarget.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cotarget.config import RigConfig
+    from cotarget.drivers.rig import Device
+
+
+CONSENT = "yes"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_rig(parser)
+    parser.add_argument("--yes", action="store_true", help="confirm that camera and cables are clear of it")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Reset the pan-tilt unit after consent."""
+    from cotarget.backends import load_config
+    from cotarget.drivers.clock import MonotonicClock
+    from cotarget.drivers.interlock import rig_lock
+    from cotarget.drivers.rig import devices
+    from cotarget.safety.signals import end_politely
+    from cotarget.safety.stop_file import StopLook, refuse_if_stopped
+    from cotarget.schema import missing_key
+
+    config = load_config(options.rig)
+    head = devices(config.hardware)["head"]
+    if config.backend != "hardware" or missing_key(head.settings):
+        raise ConfigError(f'{options.rig}: names no pan-tilt unit; backend = "hardware" and [hardware.head] port do')
+    refuse_if_stopped(config.safety.stop_file)
+    if not hasattr(head.driver, "reset"):
+        _trust_position(options, config, head)
+        return
+    _ask(options, "The head will turn through its whole range. Are camera and cables clear of it?")
+    look, undo = StopLook(config.safety.stop_file), end_politely()
+    try:
+        with rig_lock(*head.addresses, file=options.rig):
+            done = head.driver.reset(head.settings, MonotonicClock(), config.safety, look.reason)
+    finally:
+        undo()
+        look.close()
+    print(f"reset: {done}")
+
+
+def _trust_position(options: argparse.Namespace, config: "RigConfig", head: "Device") -> None:
+    """Remove the position-lost marker of a unit without a reset after consent."""
+    from cotarget.drivers.interlock import PositionLostMarker
+    from cotarget.drivers.rig import port_of
+
+    lost = PositionLostMarker(port_of(head), config.safety.stop_file)
+    if not lost.files():
+        raise ConfigError(f"{options.rig}: the driver of {head.where} has no reset; the unit needs none")
+    _ask(options, "The unit has no reset; switch it off and on. Does it stand where it reports?")
+    lost.forget()
+    print("reset: the reported position counts as true again")
+
+
+def _ask(options: argparse.Namespace, question: str) -> None:
+    """Ask for consent, unless --yes gives it.
+
+    Raises:
+        ConfigError: the answer is not yes, or there is none.
+    """
+    if options.yes:
+        return
+    print(f"{question} [yes/no]", flush=True)
+    try:
+        answer = sys.stdin.readline() if sys.stdin is not None else ""
+    except (OSError, ValueError):  # closed terminal, closed file, or not text
+        answer = ""
+    if answer.strip().lower() != CONSENT:
+        raise ConfigError("not reset; it needs the answer yes, or --yes")
