@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 from annotated_types import Ge, Gt, Interval, Le
 
-from cotarget.errors import ConfigError, choices
+from cotarget.errors import ConfigError, choices, naming
 from cotarget.files import assets_dir
 from cotarget.geometry import pose
 from cotarget.plugins import FORM, is_own, locate
@@ -562,6 +562,19 @@ class SafetyConfig:
 
 
 @model
+class FollowConfig:
+    """What `cotarget follow` takes where its options do not say.
+
+    Attributes:
+        target: name of the target; by default the only one of a simulated scene.
+        calibration: the rig's calibration, relative to rig.toml; calibration.json beside rig.toml by default.
+    """
+
+    target: str | None = None
+    calibration: FilePath | None = None
+
+
+@model
 class RigConfig:
     """All tables of rig.toml.
 
@@ -572,6 +585,7 @@ class RigConfig:
         recording: folder of the recording, for the backend "replay"; relative to rig.toml.
         board: the calibration board.
         safety: limits of motion.
+        follow: what to follow.
         targets: target profiles by name.
     """
 
@@ -581,6 +595,7 @@ class RigConfig:
     recording: FilePath | None = None
     board: BoardConfig = field(default_factory=BoardConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
+    follow: FollowConfig = field(default_factory=FollowConfig)
     targets: Mapping[str, TargetProfile] = field(default_factory=lambda: dict(DEFAULT_TARGETS))
 
     def target(self, name: str) -> TargetProfile:
@@ -681,6 +696,9 @@ def parse_config(table: Mapping[str, Any], folder: Path | None = None) -> RigCon
     config = validate(RigConfig, table, "", folder=folder)
     config = replace(config, targets=targets, sim=_fit_sizes(config.sim, table.get("sim", {})))
     check_corners(config.board)
+    if config.follow.target is not None:
+        with naming("follow.target"):
+            config.target(config.follow.target)
     return config
 
 
@@ -692,10 +710,12 @@ def _of_kind(targets: Mapping[str, TargetProfile], name: str) -> TargetProfile |
 def config_table(config: RigConfig) -> dict[str, Any]:
     """Convert a configuration to tables that `parse_config` reads.
 
-    Passwords are left out, and so is what would keep a replay from running, such as the stop file.
+    Passwords are left out, and so is what would keep a replay from running, such as the stop file, or is not of the
+    rig, such as what to follow.
     """
     table: dict[str, Any] = as_table(replace(config, recording=None))
     table["safety"].pop("stop_file", None)
+    del table["follow"]
     devices = {name: _without_secrets(device) for name, device in table.pop("hardware").items() if device}
     return table | ({"hardware": devices} if devices else {})
 

@@ -168,6 +168,7 @@ def command_line() -> str:
         parts.append(_grid(("argument", "meaning"), rows) if rows else "")
         epilog = parser.make_epilog() if parser.make_epilog else parser.epilog
         parts.append(f"```text\n{epilog}\n```\n" if epilog else "")
+        parts.append(f"Example: `{parser.example}`\n")
     return "\n".join(parts)
 
 

@@ -133,7 +133,7 @@ def read_object(path: Path, wanted: str) -> Table:
         text = path.read_text(encoding="utf-8")
         table = json.loads(text, parse_constant=refuse)
     except FileNotFoundError:
-        raise CalibrationError(f"{path}: no such file") from None
+        raise CalibrationError(f"{path}: no such file; {wanted}") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise CalibrationError(f"{path}: cannot be read: {reason}") from None

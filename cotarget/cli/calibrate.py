@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
     BOARD_KINDS,
+    RIG,
     add_file,
     board_corners,
     check_board_size,
@@ -36,8 +37,9 @@ SESSION = ("placements", "stops")  # options of a capture session
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml: drive that rig through a capture plan")
+    source = parser.add_mutually_exclusive_group()
+    about = f"rig.toml: drive that rig through a capture plan ({RIG})"
+    source.add_argument("--rig", type=Path, metavar="FILE", help=about)
     source.add_argument("--from", type=Path, metavar="DIR", dest="source", help="captures taken earlier, or photos")
     about = "file to write (calibration.json); an earlier one is kept under another name"
     add_file(parser, "--out", about, default=Path("calibration.json"))
@@ -71,6 +73,8 @@ def run(options: argparse.Namespace) -> None:
     from cotarget.config import BoardConfig
     from cotarget.safety.stop_file import refuse_if_stopped
 
+    if options.source is None:
+        options.rig = options.rig or RIG
     config = None if options.rig is None else load_config(options.rig)
     inputs = _photos(options) if config is None else rig_files(options.rig, config)
     check_outputs([], inputs, options.captures)

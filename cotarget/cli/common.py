@@ -258,7 +258,7 @@ def add_file(parser: argparse.ArgumentParser, name: str, about: str, metavar: st
 
 def add_rig(parser: argparse.ArgumentParser) -> None:
     """Add --rig of a command that needs a rig."""
-    add_file(parser, "--rig", "rig.toml", required=True)
+    add_file(parser, "--rig", f"rig.toml ({RIG})", default=RIG)
 
 
 def add_insist(parser: argparse.ArgumentParser) -> None:

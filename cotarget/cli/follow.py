@@ -24,17 +24,22 @@ from cotarget.cli.pipeline_run import (
     run_observed,
     warn_if_unseen,
 )
-from cotarget.errors import naming
+from cotarget.errors import ConfigError, choices, naming
 
 if TYPE_CHECKING:
-    from cotarget.rig import Rig
+    from cotarget.config import RigConfig
+    from cotarget.rig import Rig, RigSpec
+
+CALIBRATION = "calibration.json"  # beside rig.toml
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     add_rig(parser)
-    add_file(parser, "--calibration", "calibration.json", required=True)
-    parser.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
+    about = "calibration.json (that of [follow] in rig.toml, or beside rig.toml)"
+    add_file(parser, "--calibration", about)
+    about = "a target of rig.toml (that of [follow], or the only one of a simulated scene)"
+    parser.add_argument("--target", metavar="NAME", help=about)
     add_selection(parser)
     parser.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
     add_outputs(parser)
@@ -61,16 +66,18 @@ def run(options: argparse.Namespace) -> int:
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
+    spec = describe(config)
+    name = options.target or config.follow.target or _only_target(spec, config)
     with naming("--target"):
-        target = config.target(options.target)  # an unknown one is refused before the long work
-    spec, calibration = describe(config), Calibration.load(options.calibration)
-    files = options.calibration, options.rig
-    check_outputs(output_files(options), [*rig_files(options.rig, config), options.calibration], options.record)
-    check_run(calibration, spec, target, options.target, insist=options.insist, files=files)
+        target = config.target(name)  # an unknown one is refused before the long work
+    file = options.calibration or config.follow.calibration or options.rig.parent / CALIBRATION
+    calibration = Calibration.load(file)
+    check_outputs(output_files(options), [*rig_files(options.rig, config), file], options.record)
+    check_run(calibration, spec, target, name, insist=options.insist, files=(file, options.rig))
     selection, rate_hz = Selection(options, spec.fixed.size), spec.fixed.rate_hz
     seconds = math.inf if options.seconds is None else options.seconds
     with (
-        Recorder(options.record, config, options.calibration, options.target, selection.selector)
+        Recorder(options.record, config, file, name, selection.selector)
         if options.record
         else nullcontext() as recorder
     ):
@@ -80,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
             return guard(recorder.wrap(rig) if recorder else rig, config.safety)
 
         expected = None if math.isinf(seconds) else math.ceil(seconds * rate_hz)
-        run = Run(opened, config, calibration, options.target, rate_hz, selection, seconds, expected)
+        run = Run(opened, config, calibration, name, rate_hz, selection, seconds, expected)
         result = run_observed(run, options)
         if result.interrupt is None:  # a run cut short may not have had the time to see anything
             warn_if_unseen("follow", run, result.counts)
@@ -88,3 +95,11 @@ def run(options: argparse.Namespace) -> int:
         if result.interrupt is not None:
             raise result.interrupt
     return result.counts.exit_status
+
+
+def _only_target(spec: "RigSpec", config: "RigConfig") -> str:
+    """Return the target of a simulated scene that has one."""
+    if spec.targets is None or len(spec.targets) != 1:
+        names = choices(spec.targets or config.targets)
+        raise ConfigError(f"--target: missing; give one of: {names}; or in rig.toml: [follow] target")
+    return spec.targets[0]

@@ -24,7 +24,7 @@ PREVIEW_SHARE = 2  # the viewfinder's images are smaller than stills by this fac
 QUALITY = 90  # of JPEG, as the simulated cameras have by default
 PAN_SIGN = -1  # positive pan turns left, as in the D46's manual
 FAULTS: Mapping[str, tuple[str, ...]] = {"head": D46_FAULTS, "fixed": AXIS_FAULTS, "zoom": S5IS_FAULTS}
-COPIED = ("board", "safety", "targets")  # tables of the simulated rig's file that also hold for the emulated one
+COPIED = ("board", "follow", "safety", "targets")  # tables of the simulated rig's file that hold for the emulated one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,8 +224,9 @@ def copied_tables(table: Mapping[str, Any], directory: Path) -> dict[str, Any]:
             else target
             for name, target in copied["targets"].items()
         }
-    if isinstance(copied.get("safety", {}).get("stop_file"), str):
-        copied["safety"] = {**copied["safety"], "stop_file": str((directory / table["safety"]["stop_file"]).resolve())}
+    for name, key in (("safety", "stop_file"), ("follow", "calibration")):
+        if isinstance(copied.get(name, {}).get(key), str):
+            copied[name] = {**copied[name], key: str((directory / table[name][key]).resolve())}
     return copied
 
 

@@ -25,6 +25,7 @@ CLOSE = 1e-9
 AIM = ("aim", "--calibration", "good.json", "--pixel", "320", "240")
 FOLLOW = ("follow", "--rig", "rig.toml", "--calibration", "good.json", "--target", "book",
           "--csv", "out.csv", "--video", "out.mp4")  # fmt: skip
+TABLE = '[follow]\ntarget = "book"\ncalibration = "mine.json"\n'
 FROM = ("calibrate", "--out", "new.json", "--from")
 PHOTOS = ("--fixed", "left*.png", "--zoom", "right*.png", "--square", "0.1", "--board")
 
@@ -233,6 +234,16 @@ def test_follow_writes_a_table_and_a_film(folder, capsys):
     capture = cv2.VideoCapture(str(folder / "out.mp4"))
     assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == printed["steps"]
     capture.release()
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(("calibration", "table"), [("calibration.json", ""), ("mine.json", TABLE)])
+def test_follow_needs_no_option_in_the_folder_of_a_rig(folder, capsys, calibration, table):
+    (folder / "good.json").rename(folder / calibration)
+    scene = ["book", "person"] if table else ["book"]
+    (folder / "rig.toml").write_text(f'[sim]\nscene = "indoor"\ntargets = {json.dumps(scene)}\n{table}')
+    status, out, err = call(capsys, "follow", "--seconds", "0.3")  # without it, to Ctrl-C
+    assert (status, err, json.loads(out)["steps"] >= 6) == (0, "", True)
 
 
 def test_detect_writes_a_table(folder, capsys):

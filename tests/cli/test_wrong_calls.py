@@ -29,6 +29,7 @@ FILES = {
     "rig.toml": '[sim]\nscene = "indoor"\ntargets = ["book"]\n[safety]\nstop_file = "stop"\n',
     "sim.toml": "[sim]\n",
     "dog.toml": "[targets.dog]\nsize = 0.6\ndimension = 'height'\nwanted_px = 500\ndetector = 'motion'\n",
+    "cat.toml": '[follow]\ntarget = "cat"\n',
     "house.toml": '[sim]\ntargets = ["book"]\n[targets.book]\nsize = 23.4\n',
     "crow.toml": '[sim]\ntargets = ["bird"]\n[targets.crow]\nsize = 180\ndimension = "wingspan"\nwanted_px = 160\n',
     "narrow.toml": "[safety]\npan_deg = [-5, 5]\n",
@@ -123,6 +124,8 @@ CALLS = [
     ("aim --calibration millimetres.json --pixel 3 4 --depth 5", FAILED, POSE, "metres", "--insist"),
     ("aim --calibration wide.json --pixel 3 4 --depth 5 --rig rig.toml", FAILED, "wide.json: ", "640x360"),
     # follow and replay
+    ("follow --calibration good.json --rig dog.toml", FAILED, "--target: missing", "dog, person", "[follow] target"),
+    ("point --rig cat.toml", FAILED, "cat.toml: follow.target: unknown target 'cat'", "bird, book, person"),
     (f"{TARGET} cat", FAILED, "--target", "'cat'"),
     ("follow --calibration good.json --rig dog.toml --target dog", FAILED, "dog.toml", "[sim] targets"),
     ("follow --calibration good.json --rig hw.toml --target book", FAILED, "good.json: ", "704x576"),
@@ -175,7 +178,10 @@ CALLS = [
 # Messages that a newcomer meets first, word for word.
 FIRST = {
     "": "the following arguments are required: COMMAND; see cotarget --help",
-    "calibrate": "one of the arguments --rig --from is required; see cotarget calibrate --help",
+    "calibrate --rig rig.toml --from index": (
+        "argument --from: not allowed with argument --rig; see cotarget calibrate --help"
+    ),
+    "follow": "calibration.json: no such file; give a calibration.json, as cotarget calibrate writes it",
     "follow --calibration good.json --rig none.toml --target book": (
         "none.toml: no such file; give the path of a rig.toml"
     ),

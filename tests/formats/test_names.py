@@ -130,6 +130,8 @@ def test_v010_rig_files_name_every_key():
         "targets.book.shape",
         "targets.book.network",
         "hardware.fixed.password_env",
+        "follow.target",
+        "follow.calibration",
         *(f"hardware.{name}.driver" for name in DRIVERS),
     }
     assert {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in KEYS} - newer == found
@@ -191,7 +193,7 @@ def test_a_command_ends_with_the_listed_status(old, capsys):
     assert main(["point", "--rig", "rig_recording.toml"]) == statuses()["a device, or the rig, fails"]
     assert main(["point", "--rig", "no.toml"]) == statuses()["a file is wrong or missing"]
     with pytest.raises(SystemExit) as ended:
-        main(["point"])
+        main(["point", "--no-such-option"])
     assert ended.value.code == statuses()["an argument is wrong"]
     log = old / "recording" / "log.jsonl"
     other = re.sub(r'("head.move", "at": [0-9.]+, "args": \[)[-0-9.]+', r"\g<1>0.1", log.read_text(), count=1)
