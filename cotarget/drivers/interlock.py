@@ -14,7 +14,6 @@ import contextlib
 import errno
 import hashlib
 import logging
-import os
 import re
 import socket
 import sys
@@ -24,11 +23,11 @@ from urllib.parse import urlsplit
 
 from cotarget.drivers.link_errors import InUseError
 from cotarget.errors import DeviceError
+from cotarget.safety.stop_file import state_folder
 
 log = logging.getLogger(__name__)
 SUFFIX = ".position-lost"
-STATE_HOME, STATE_HOME_DEFAULT = "XDG_STATE_HOME", "~/.local/state"  # XDG base directory specification
-WITHOUT_STOP_FILE = Path("cotarget") / "head"  # below the state folder
+WITHOUT_STOP_FILE = "head"  # in the state folder
 NO_REASON = "the position of a pan-tilt unit may be lost; see that it is free, then run cotarget reset-head"
 LONGEST_NAME, LONGEST_REASON = 100, 500  # port in the file's name, reason in messages [characters]
 
@@ -48,7 +47,7 @@ class PositionLostMarker:
         self._has_lasting_port = not port.startswith("/dev/pts/")  # another emulator gets a pseudo-terminal's name
         lasting = [each for each in _identities(port) if not each.startswith("/")]  # another unit may get that name
         names = [re.sub(r"[^A-Za-z0-9.]+", "-", each).strip("-")[-LONGEST_NAME:] for each in (port, *lasting)]
-        without = _state_home() / WITHOUT_STOP_FILE
+        without = state_folder() / WITHOUT_STOP_FILE
         beside = without if stop_file is None else stop_file.absolute()
         self._folder, self._begin = beside.parent, f"{beside.name}."
         self.file = self._folder / f"{self._begin}{names[0]}{SUFFIX}"
@@ -107,10 +106,6 @@ class PositionLostMarker:
                 continue
             except OSError as error:
                 raise DeviceError(f"{file}: cannot be removed, though the unit was reset: {error.strerror}") from None
-
-
-def _state_home() -> Path:
-    return Path(os.environ.get(STATE_HOME) or STATE_HOME_DEFAULT).expanduser().absolute()
 
 
 def _reason(file: Path) -> str:

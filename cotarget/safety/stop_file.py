@@ -1,15 +1,29 @@
-"""Emergency stop across processes by a file: while it exists, the head does not move; it holds the reason."""
+"""Emergency stop across processes by a file: while it exists, the head does not move; it holds the reason.
 
+A program that watches a stop file keeps a locked file in the user's state folder that names it, so that `cotarget stop`
+finds every open rig. The lock ends with the program, however it ends.
+"""
+
+import contextlib
+import logging
 import math
 import os
 import re
 import threading
+import time
 import tomllib
+import weakref
+from collections.abc import Callable
 from pathlib import Path
 from time import monotonic
 
 from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 
+log = logging.getLogger(__name__)
+STATE_HOME, STATE_HOME_DEFAULT = "XDG_STATE_HOME", "~/.local/state"  # XDG base directory specification
+WATCHING = "watching-"  # begins the names of the files that name watched stop files
+# Age from which such a file without a lock counts as left over; a younger one may be about to be locked [s].
+LEFT_OVER_S = 60.0
 NO_REASON = "no reason given"
 LONGEST_REASON = 200  # shown part of the file's first line [characters]
 SUFFIX = ".stop"  # of the default stop file
@@ -167,6 +181,60 @@ def clear_stop_file(path: Path) -> str | None:
     return reason
 
 
+# The stop files that programs watch
+
+
+def state_folder() -> Path:
+    """Return the folder of what one program of this user leaves for another."""
+    return Path(os.environ.get(STATE_HOME) or STATE_HOME_DEFAULT).expanduser().absolute() / "cotarget"
+
+
+def same_place(path: Path) -> Path:
+    """Return one spelling of all paths of a file."""
+    return path.parent.resolve() / path.name
+
+
+def _announce(path: Path | None) -> Callable[[], None]:
+    """Make the locked file by which `watched_stop_files` finds a stop file; return what removes it.
+
+    A failure is logged.
+    """
+    import fcntl
+    import tempfile
+
+    made = contextlib.ExitStack()
+    try:
+        if path is not None:
+            (folder := state_folder()).mkdir(parents=True, exist_ok=True)
+            descriptor, name = tempfile.mkstemp(prefix=WATCHING, dir=folder)
+            made.callback(os.close, descriptor)
+            made.callback(Path(name).unlink, missing_ok=True)
+            os.write(descriptor, os.fsencode(same_place(path)))
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+    except (OSError, RuntimeError) as error:  # a user may have no home
+        log.warning("%s: is watched, but only 'cotarget stop --rig' finds it: %s", path, error)
+    return made.close
+
+
+def watched_stop_files() -> set[Path]:
+    """Find the stop files that running programs of this user watch, each by `same_place`."""
+    import fcntl
+
+    found, files = set(), list[Path]()
+    with contextlib.suppress(RuntimeError):  # there is no home
+        files += state_folder().glob(f"{WATCHING}*")
+    for each in files:
+        with contextlib.suppress(OSError), each.open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                found.add(Path(os.fsdecode(file.read())))
+            else:
+                if time.time() - each.stat().st_mtime > LEFT_OVER_S:
+                    each.unlink()
+    return found
+
+
 # Reading the file from a program that must not wait for it
 
 LOOK_POLL_S = 0.05  # reading the stop file takes well below 1 ms; the answer is awaited in slices of this time [s]
@@ -185,6 +253,7 @@ class StopLook:
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
+        self._withdraw = weakref.finalize(self, _announce(path))
         self._changed = threading.Condition()
         self._asked = self._answered = self._missed = 0
         self._reason: str | None = None
@@ -231,6 +300,8 @@ class StopLook:
             self._changed.notify_all()
         if self._thread is not None:
             self._thread.join(LOOK_JOIN_S)
+        with contextlib.suppress(OSError):
+            self._withdraw()
 
     def _run(self) -> None:
         while True:

@@ -1,5 +1,6 @@
 """Commands of an operator: stop, clear, reset-head, latency, board; and consent before the head moves."""
 
+import contextlib
 import io
 import json
 import os
@@ -10,12 +11,13 @@ from pathlib import Path
 import pytest
 
 from cotarget.backends import OPENERS
-from cotarget.config import RigConfig
+from cotarget.config import RigConfig, SafetyConfig
 from cotarget.drivers import ptu_d46
 from cotarget.drivers.interlock import PositionLostMarker, rig_lock
 from cotarget.emulators.emulation import copied_tables
 from cotarget.errors import EmergencyStopError
 from cotarget.latency import Delay, HeadLatency
+from cotarget.safety.safe_rig import guard
 from cotarget.safety.stop_file import refuse_if_stopped
 from tests.support.commands import HARDWARE, NO_PORT, call, refused, true_calibration
 from tests.support.rigs import rig_of
@@ -132,6 +134,34 @@ def test_missing_folder_of_the_stop_file_fails_stop_and_point(folder, capsys):
     )
     assert refused(capsys, "point", "--rig", "stops.toml").startswith(f"cotarget point: {folder / 'run/stop'}: ")
     assert not (folder / "run").exists()
+
+
+def test_stop_without_options_stops_every_open_rig_whatever_the_folder_has(folder, capsys):
+    (folder / "rig.toml").write_text("[sim\n")
+    with guard(rig_of(SimulatedDevices()), SafetyConfig(stop_file=folder / "run" / "stop")):
+        status, out, err = call(capsys, "stop", "--reason", "smoke")
+        assert (status, out.count("stopped: "), "rig.toml: is not TOML" in err) == (0, 1, True)
+    assert (folder / "run" / "stop").read_text() == "smoke\n"
+    assert "rig.toml: is not TOML" in refused(capsys, "stop")  # no rig is open any more
+    (folder / "rig.toml").unlink()
+    assert "no program of this user has a rig open" in refused(capsys, "stop")
+
+
+def test_stop_without_options_stops_the_folders_rig_and_says_when_no_program_watches(folder, capsys):
+    (folder / "rig.toml").write_text(STOP_FILE)
+    status, out, err = call(capsys, "stop")
+    assert (status, str(folder / "run" / "stop") in out, "no program of this user watches" in err) == (0, True, True)
+    assert (folder / "run" / "stop").exists()
+
+
+def test_a_stop_that_cannot_be_written_keeps_no_other_from_being_written(folder, capsys):
+    (folder / "gone").mkdir()
+    with contextlib.ExitStack() as opened:
+        for name in ("gone", "run"):
+            opened.enter_context(guard(rig_of(SimulatedDevices()), SafetyConfig(stop_file=folder / name / "stop")))
+        (folder / "gone").rmdir()
+        status, _, err = call(capsys, "stop")
+        assert (status, "gone/stop: NOT stopped" in err, (folder / "run" / "stop").exists()) == (1, True, True)
 
 
 @pytest.mark.parametrize("command", ["stop", "--help"])

@@ -216,6 +216,7 @@ def _read(terminal):
 
 
 AIM = "aim --calibration good.json --pixel 320 240 --depth 9"
+WANTED = "give a calibration.json, as cotarget calibrate writes it"
 ASCII = "LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0"
 
 
@@ -228,9 +229,9 @@ ASCII = "LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0"
     ("", "aim --help >/dev/full", 1, "", "cotarget aim: No space left on device\n"),
     ("", "dance 2>/dev/full", 2, "", ""),
     ("", "stop --rig \xfc.toml >&-", 1, "", "cotarget stop: stdout is closed\n"),
-    ("", "stop --rig \xfc.toml --reason V\udcf6gel", 0, "stopped: ", ""),  # no UTF-8
+    ("", "stop --rig \xfc.toml --reason V\udcf6gel 2>&-", 0, "stopped: ", ""),  # no UTF-8
     (ASCII, f"{AIM} --rig \xfc.toml", 1, "", "cotarget aim: \xfc.toml: sim.seed: '\\xf6' should be a valid integer\n"),
-    ("", AIM.replace("good", "fr\udcfch"), 1, "", "cotarget aim: fr\udcfch.json: no such file\n"),
+    ("", AIM.replace("good", "fr\udcfch"), 1, "", f"cotarget aim: fr\udcfch.json: no such file; {WANTED}\n"),
 ])  # fmt: skip
 def test_streams_that_are_closed_full_or_of_another_locale(folder, before, line, status, out, err):
     """One line says so, the exit status is not Python's own, and a stop is written whatever stdout is."""
