@@ -163,8 +163,9 @@ def command_line() -> str:
         parser.formatter_class = partial(argparse.HelpFormatter, width=96)
         parts += [_heading(f"cotarget {name}", name), f"{parser.description[:1].upper()}{parser.description[1:]}.\n"]
         parts.append(f"```text\n{parser.format_usage()}```\n".replace("usage: ", "").replace("\n       ", "\n"))
+        hidden = [a.dest for a in parser._actions if a.help == argparse.SUPPRESS]
         write = parser._get_formatter()._format_action_invocation
-        rows = [(f"`{write(a)}`", a.help or "") for a in parser._actions if a.dest not in ("help", "verbose")]
+        rows = [(f"`{write(a)}`", a.help or "") for a in parser._actions if a.dest not in ("help", "verbose", *hidden)]
         parts.append(_grid(("argument", "meaning"), rows) if rows else "")
         epilog = parser.make_epilog() if parser.make_epilog else parser.epilog
         parts.append(f"```text\n{epilog}\n```\n" if epilog else "")

@@ -34,8 +34,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     how_close.add_argument("--wanted-px", type=positive, metavar="N", help=about)
     how_close.add_argument("--focal-mm", type=positive, metavar="F", help="focal length to use [mm]")
     add_file(parser, "--rig", "rig.toml, for limits and targets (the default rig)")
-    about = "inverse kinematics: exact, or a reading of the paper's shortcut (exact)"
-    parser.add_argument("--ik", choices=("exact", "paper-table", "paper-example"), default="exact", help=about)
+    ways = ("exact", "paper-table", "paper-example")  # compared by `python -m experiments shortcut`
+    parser.add_argument("--ik", choices=ways, default="exact", help=argparse.SUPPRESS)
     add_insist(parser)
 
 

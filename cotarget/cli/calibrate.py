@@ -58,8 +58,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "6 more placements far away (8)"
     )
     parser.add_argument("--stops", type=whole(1), metavar="N", help=about)
-    about = "one fit of everything, or the paper's step-by-step method (joint)"
-    parser.add_argument("--method", choices=("joint", "sequential"), default="joint", help=about)
+    methods = ("joint", "sequential")  # compared by `python -m experiments chain`
+    parser.add_argument("--method", choices=methods, default="joint", help=argparse.SUPPRESS)
     parser.add_argument("--encoders", action="store_true", help="calibrate the encoders' scales and zeros too")
     about = "go on where the motions leave something undetermined, with an uncertainty to match"
     parser.add_argument("--insist", action="store_true", help=about)

@@ -312,6 +312,18 @@ def test_point_moves_no_axis_that_is_not_asked_for(pointed, capsys, folder, want
     assert bool([what for what, _ in pointed.head.log if what == "move"]) == (moved is not None)
 
 
+def test_where_says_where_a_stopped_head_stands_and_moves_nothing(pointed, capsys, folder):
+    pointed.head.move(math.radians(30), 0.0, wait=True)
+    pointed.head.log.clear()
+    (folder / "rig.toml").write_text('[safety]\nstop_file = "stop"\n')
+    (folder / "stop").write_text("smoke")
+    status, out, err = call(capsys, "where")
+    said = json.loads(out)
+    assert (status, err, said["moving"]) == (0, "", False)
+    assert [said["pan_deg"], said["tilt_deg"]] == pytest.approx([30, 0], abs=math.degrees(pointed.head.limits.step))
+    assert "move" not in [what for what, _ in pointed.head.log]
+
+
 def test_point_fails_where_the_head_did_not_arrive(pointed, capsys):
     """Its driver returns from a move that it waited for, and the head stands elsewhere."""
     pointed.head.state = lambda: PanTiltState(0.1, 0.0, moving=False, t=pointed.clock.now())
