@@ -647,7 +647,8 @@ def read_text(path: Path) -> str:
     try:
         return path.read_text(encoding=ENCODING)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; give the path of a rig.toml") from None
+        what = "no such file; give the path of a rig.toml, or make one: cotarget config > rig.toml"
+        raise ConfigError(f"{path}: {what}") from None
     except IsADirectoryError:
         raise ConfigError(f"{path}: is a directory; give the path of a rig.toml") from None
     except OSError as error:

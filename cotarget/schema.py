@@ -10,13 +10,15 @@ pydantic is imported at the first `validate`, because commands such as `cotarget
 
 import dataclasses
 import functools
+import inspect
 import json
+import re
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast, dataclass_transform
+from typing import Annotated, Any, NamedTuple, TypeVar, cast, dataclass_transform
 
 from annotated_types import Ge, Gt
 
@@ -25,6 +27,7 @@ from cotarget.geometry import RigidTransform, pose, pose_dict
 
 T = TypeVar("T")
 STRICT = {"strict": True, "extra": "forbid", "allow_inf_nan": False, "arbitrary_types_allowed": True}
+ATTRIBUTE = re.compile(r"^    (\w+): (.*(?:\n {8}.*)*)", re.MULTILINE)  # of a docstring
 CONFIG = "__pydantic_config__"  # where pydantic looks for a dataclass's settings
 
 
@@ -151,6 +154,46 @@ class _PoseTable:
 
     translation: Annotated[tuple[float, float, float], "[x, y, z]"]
     rotvec_deg: Annotated[tuple[float, float, float], "[rx, ry, rz]"]
+
+
+# Description
+
+
+class Key(NamedTuple):
+    """A key of a table: its name, annotation, default, and what the dataclass's docstring says of it."""
+
+    name: str
+    hint: Any
+    default: Any
+    meaning: str
+
+    @property
+    def table(self) -> type[Any] | None:
+        """The dataclass of the table that the key holds, or of each of its tables by name; None for a value."""
+        hint = bare(self.hint)
+        held = typing.get_args(hint)[1] if typing.get_origin(hint) is Mapping else hint
+        return held if dataclasses.is_dataclass(held) else None  # type: ignore[return-value]
+
+
+def keys_of(cls: type[Any]) -> list[Key]:
+    """List the keys of a dataclass's table, with what "Attributes:" says of them in its docstring and its bases'."""
+    sections = (inspect.cleandoc(each.__doc__ or "").partition("Attributes:\n")[2] for each in cls.__mro__[-2::-1])
+    said = {name: " ".join(text.split()).rstrip(".") for each in sections for name, text in ATTRIBUTE.findall(each)}
+    hints = typing.get_type_hints(cls, include_extras=True)
+    return [
+        Key(f.name, hints[f.name], f.default_factory() if callable(f.default_factory) else f.default, said[f.name])
+        for f in dataclasses.fields(cls)
+    ]
+
+
+def toml_text(value: Any) -> str:
+    """Write a value as TOML has it, in one line; a pose to nine digits."""
+    value = as_table(value)
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {toml_text(each)}' for key, each in value.items())} }}".replace("{  }", "{}")
+    if isinstance(value, list):
+        return f"[{', '.join(map(toml_text, value))}]"
+    return json.dumps(round(value, 9) if isinstance(value, float) else value)
 
 
 # Validation

@@ -6,7 +6,6 @@ that both pages are as the code is.
 
 import argparse
 import dataclasses
-import inspect
 import json
 import re
 import typing
@@ -15,8 +14,6 @@ from functools import partial, reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import griffe
-
 from cotarget.backends import check
 from cotarget.cli.main import make_parser
 from cotarget.config import DEFAULT_TARGETS, HardwareConfig, RigConfig, parse_config
@@ -24,8 +21,8 @@ from cotarget.drivers import DRIVERS
 from cotarget.drivers.board import BoardSettings
 from cotarget.drivers.rig import ROLES, device_of
 from cotarget.errors import ConfigError
-from cotarget.geometry import RigidTransform, pose_dict
-from cotarget.schema import bare, form_of
+from cotarget.geometry import RigidTransform
+from cotarget.schema import bare, form_of, keys_of, toml_text
 
 MARK = "<!-- made from the code -->"
 KINDS = {bool: "boolean", int: "integer", float: "number", str: "string", Path: "path"}
@@ -62,25 +59,16 @@ def _hardware() -> Iterator[str]:
 
 def _tables(where: str, cls: type[Any], driver: str = "") -> Iterator[str]:
     """Describe one table, then the tables in it."""
-    docstrings = [griffe.Docstring(inspect.cleandoc(each.__doc__ or "")) for each in cls.__mro__[-2::-1]]
-    sections = [section for each in docstrings for section in each.parse("google", warnings=False)]
-    attributes = [each for section in sections if section.kind.value == "attributes" for each in section.value]
-    meanings = {each.name: " ".join(each.description.split()).rstrip(".") for each in attributes}
-    hints, rows, inner = typing.get_type_hints(cls, include_extras=True), list[tuple[str, ...]](), list[Any]()
-    for field in dataclasses.fields(cls):
-        key, hint = f"{where}.{field.name}".lstrip("."), hints[field.name]
-        by_name = typing.get_origin(bare(hint)) is Mapping
-        held = typing.get_args(bare(hint))[1] if by_name else bare(hint)
-        if dataclasses.is_dataclass(held):
-            inner.append((f"{key}.NAME" if by_name else key, held))
+    rows, inner = list[tuple[str, ...]](), list[Any]()
+    for each in keys_of(cls):
+        name, hint, default, meaning = each
+        key = f"{where}.{name}".lstrip(".")
+        if each.table is not None:
+            inner.append((f"{key}.NAME" if typing.get_origin(bare(hint)) is Mapping else key, each.table))
             continue
-        default = field.default_factory() if callable(field.default_factory) else field.default
-        meaning = meanings.get(field.name, "")
-        if not meaning:
-            raise ValueError(f"{cls.__name__}: 'Attributes:' has no {field.name}")
-        by_suffix = [unit for end, unit in UNITS.items() if field.name.endswith(f"_{end}")]
+        by_suffix = [unit for end, unit in UNITS.items() if name.endswith(f"_{end}")]
         unit, meaning = (UNIT_IN_TEXT.findall(meaning) or by_suffix or [""])[0], UNIT_IN_TEXT.sub("", meaning)
-        rows.append((f"`{field.name}`", _kind(hint), unit, _toml(default), _range(key, hint, default, driver), meaning))
+        rows.append((f"`{name}`", _kind(hint), unit, _toml(default), _range(key, hint, default, driver), meaning))
     title, anchor = f"`[{where}]`" if where else "Outside of the tables", where or "backend"
     if driver:
         names = DRIVERS[where.rpartition(".")[2]]
@@ -116,10 +104,7 @@ def _toml(value: Any) -> str:
     """Write a default as rig.toml has it."""
     if value in (None, dataclasses.MISSING):
         return "none" if value is None else "required"
-    if isinstance(value, RigidTransform):
-        rows = (f"{key} = {[round(number, 9) for number in row]}" for key, row in pose_dict(value).items())
-        return f"`{{ {', '.join(rows)} }}`"
-    return f"`{json.dumps(value)}`"
+    return f"`{toml_text(value)}`"
 
 
 def _range(key: str, hint: Any, default: Any, driver: str) -> str:

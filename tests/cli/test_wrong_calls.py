@@ -183,7 +183,7 @@ FIRST = {
     ),
     "follow": "calibration.json: no such file; give a calibration.json, as cotarget calibrate writes it",
     "follow --calibration good.json --rig none.toml --target book": (
-        "none.toml: no such file; give the path of a rig.toml"
+        "none.toml: no such file; give the path of a rig.toml, or make one: cotarget config > rig.toml"
     ),
     f"{TARGET} dog": "--target: unknown target 'dog'; the targets are: bird, book, person",
     f"{TARGET} bird": 'rig.toml: the simulated scene has no bird; add it: [sim] targets = ["book", "bird"]',

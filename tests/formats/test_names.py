@@ -137,6 +137,22 @@ def test_v010_rig_files_name_every_key():
     assert {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in KEYS} - newer == found
 
 
+def test_config_prints_every_listed_key_with_its_default(capsys):
+    assert main(["config"]) == 0
+    text = capsys.readouterr().out
+    printed = keys_in(tomllib.loads(re.sub(r"^#(\w+) = .*$", r"\1 = 0", text, flags=re.MULTILINE)))
+    whole = r"(sim\.T_\w+|targets\.\w+\.network)\.\w+$"  # tables in one line
+    assert printed == {re.sub(whole, r"\1", key) for key in KEYS} - {"sim.effects.all"}
+    is_set = re.sub(r"^#(\w+ = (?!\.\.\.|\[[a-z]).*)$", r"\1", text, flags=re.MULTILINE)
+    assert "\nseed = 0\n" in is_set
+    default = dict(leaves(config_table(parse_config({}))))
+    for each in (text, is_set):
+        found = dict(leaves({**config_table(config := parse_config(tomllib.loads(each))), "hardware": {}}))
+        for key, value in default.items():
+            assert same_default(json.dumps(value), found[key]), key
+        assert devices(config.hardware) == devices(parse_config({}).hardware)
+
+
 # --- rig.toml of v0.1.0 ---
 FILES = ("sim.scene", "sim.models.dog", "safety.stop_file", "targets.book.template")  # relative to the rig.toml
 
