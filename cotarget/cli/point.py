@@ -15,6 +15,7 @@ from cotarget.cli.common import (
     print_json,
     rig_files,
 )
+from cotarget.cli.where import position
 from cotarget.errors import ConfigError, DeviceError
 
 
@@ -73,11 +74,4 @@ def run(options: argparse.Namespace) -> None:
             frame = rig.fixed.read(newer_than=head.t) if name == "fixed" else rig.zoom.capture()
             with previous_kept(path):
                 write_image(path, frame.image)
-    print_json(
-        {
-            "pan_deg": math.degrees(head.pan),
-            "tilt_deg": math.degrees(head.tilt),
-            "focal_mm": lens.focal_px * rig.spec.zoom.pitch_mm,
-            "pictures": {name: str(path) for name, path in shots.items()},
-        }
-    )
+    print_json(position(rig, head, lens) | {"pictures": {name: str(path) for name, path in shots.items()}})

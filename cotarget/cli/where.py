@@ -2,9 +2,13 @@
 
 import argparse
 import math
+from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import add_rig, open_named, print_json
 from cotarget.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cotarget.rig import PanTiltState, Rig, ZoomState
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -21,11 +25,13 @@ def run(options: argparse.Namespace) -> None:
         raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's head and lens are nowhere")
     with open_named(options.rig, config, guarded=False) as rig:
         head, lens = rig.head.state(), rig.zoom.state()
-    print_json(
-        {
-            "pan_deg": math.degrees(head.pan),
-            "tilt_deg": math.degrees(head.tilt),
-            "focal_mm": lens.focal_px * rig.spec.zoom.pitch_mm,
-            "moving": head.moving or lens.moving,
-        }
-    )
+    print_json(position(rig, head, lens) | {"moving": head.moving or lens.moving})
+
+
+def position(rig: "Rig", head: "PanTiltState", lens: "ZoomState") -> dict[str, Any]:
+    """Build what is printed of where head and lens are."""
+    return {
+        "pan_deg": math.degrees(head.pan),
+        "tilt_deg": math.degrees(head.tilt),
+        "focal_mm": lens.focal_px * rig.spec.zoom.pitch_mm,
+    }

@@ -5,6 +5,7 @@ finds every open rig. The lock ends with the program, however it ends.
 """
 
 import contextlib
+import fcntl
 import logging
 import math
 import os
@@ -199,7 +200,6 @@ def _announce(path: Path | None) -> Callable[[], None]:
 
     A failure is logged.
     """
-    import fcntl
     import tempfile
 
     made = contextlib.ExitStack()
@@ -218,8 +218,6 @@ def _announce(path: Path | None) -> Callable[[], None]:
 
 def watched_stop_files() -> set[Path]:
     """Find the stop files that running programs of this user watch, each by `same_place`."""
-    import fcntl
-
     found, files = set(), list[Path]()
     with contextlib.suppress(RuntimeError):  # there is no home
         files += state_folder().glob(f"{WATCHING}*")
