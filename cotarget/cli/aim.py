@@ -102,7 +102,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _check_focal_length(calibration: "Calibration", found: "Aim", pitch_mm: float) -> bool:
     """Whether an aim's focal length is among those calibrated; warn if not."""
-    from cotarget.calibration.joint import SAME_FOCAL
+    from cotarget.calibration.zoom_samples import SAME_FOCAL
 
     nominal_px = calibration.zoom_head.lens.nominal_px
     shortest, longest = nominal_px[0], nominal_px[-1]

@@ -203,6 +203,8 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None],
     for path in (folder, *outputs):
         if path is None:
             continue
+        if path == STDOUT:
+            raise ConfigError("-: stdout takes the table of --csv alone; name a file")
         goal = Path(os.path.realpath(path))
         if any(goal.is_relative_to(each) for each in taken):
             raise ConfigError(f"{path}: is read or written for something else too, or its folder is; give another name")
