@@ -229,9 +229,13 @@ def aim(
 
     Raises:
         CalibrationError: the calibration has no T, or is implausible.
-        ConfigError: the target is given in no way or in two, or the method is unknown.
+        ConfigError: the target is given in no way or in two, its size is not above zero, or the method is unknown.
         UnreachableError: no pan and tilt within the limits do it.
     """
+    if wanted_size is not None and not (0 < wanted_size.size < math.inf and 0 < wanted_size.wanted_px < math.inf):
+        raise ConfigError(
+            f"aim: wanted_size is {wanted_size.size!r} m at {wanted_size.wanted_px!r} px; both have to be above zero"
+        )
     if method not in METHODS:
         raise ConfigError(f"unknown method '{method}'; the methods are: {choices(METHODS)}")
     if x_fixed is None:

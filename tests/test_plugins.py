@@ -114,13 +114,23 @@ class DomeSettings(ZoomSettings):
         return UnitSpec(ZoomSettings().spec, HeadSpec(LIMITS, 0.02))
 
 
+class Part:
+    def __init__(self, device):
+        self.device = device
+
+    def __getattr__(self, name):
+        if name == "close":
+            raise AttributeError(name)  # the unit closes it
+        return getattr(self.device, name)
+
+
 class Dome:
     Settings = DomeSettings
 
     def __init__(self, settings, clock, safety):
         if settings.step_deg != 0.1:
             raise ConfigError("hardware.head.step_deg: its steps are 0.1 degrees")
-        self.zoom, self.head = Zoom(settings, clock), Head(settings, clock, safety)
+        self.zoom, self.head = Part(Zoom(settings, clock)), Part(Head(settings, clock, safety))
 
     @staticmethod
     def probe(settings):
@@ -134,6 +144,12 @@ class Headless(Dome):
     def __init__(self, *arguments):
         super().__init__(*arguments)
         del self.head
+
+
+class Lensless(Dome):
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.zoom = object()
 
 
 class Limitless(Head):
@@ -287,6 +303,7 @@ def test_zoom_camera_and_head_in_one_housing(rig):
     ("[hardware.ptz]", '[hardware.head]\nport = "a"\n[hardware.ptz]\n', "hardware.head: .hardware.ptz. is zoom"),
     ('driver = "devices:Dome"', 'host = "dome"', r"hardware\.ptz\.driver: is missing; give "),
     ('"devices:Dome"', '"devices:Headless"', r"hardware\.ptz\.driver: Headless has no head; "),
+    ('"devices:Dome"', '"devices:Lensless"', r"hardware\.ptz\.driver: Lensless\.zoom has no size; "),
     ('"devices:Dome"', '"devices:Head"', r"hardware\.ptz\.driver: spec of its Settings is no UnitSpec"),
     ('"devices:Dome"', '"devices:Dome"\nstep_deg = 1.0', r"hardware\.ptz\.step_deg: its steps are 0\.1 degrees"),
 ])  # fmt: skip
@@ -311,6 +328,10 @@ def with_other(rig, device, body):
 
 @pytest.mark.parametrize(("device", "method", "answer", "wanted"), [
     ("head", "state", "(0.1, 0.2)", "a PanTiltState"),
+    ("head", "state", "PanTiltState(None, 0.0, False, 0.0)", "a PanTiltState"),
+    ("zoom", "state", "ZoomState(float('nan'), False, 0.0)", "a ZoomState"),
+    ("zoom", "zoom", "float('nan')", "the focal length that the lens will "),
+    ("fixed", "read", "Frame(np.zeros((48, 64, 3), np.uint8), None)", ""),
     ("head", "move", "None", "pan and tilt as commanded [rad]"),
     ("zoom", "state", "100.0", "a ZoomState"),
     ("zoom", "zoom", "None", "the focal length that the lens will "),

@@ -27,7 +27,7 @@ from cotarget.calibration.model import CameraName, Capture, Rejected, View, unse
 from cotarget.calibration.planning import Coverage
 from cotarget.calibration.zoom_samples import same_focal
 from cotarget.config import BoardConfig
-from cotarget.errors import CalibrationError, HaltedError, StaleFrameError
+from cotarget.errors import CalibrationError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, Rotation, pose_dict
 from cotarget.rig import Clock, Frame, Image, PanTiltState, Rig, ZoomCamera, ZoomState
 
@@ -288,6 +288,8 @@ def wait_for_head(rig: Rig, wanted: tuple[float, float], way: float) -> tuple[Pa
         arrived = not state.moving and off <= limits.tolerance + POSE_TOLERANCE
         if arrived or clock.now() > deadline:
             return state, arrived
+        if (reason := rig.stopped) is not None:
+            raise EmergencyStopError(f"emergency stop: {reason}")
         clock.sleep_until(clock.now() + POLL)
 
 

@@ -17,7 +17,6 @@ POLL_S = 0.2
 SWITCH_S = 5e-4
 TARGETS = ("person",)  # targets of the scene without a rig.toml
 NO_TARGET = 'none; [sim] targets = ["person"] has one to follow'
-STOP_FILE = "stop"  # default stop file, beside the rig.toml that is written
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +56,6 @@ def run(options: argparse.Namespace) -> None:
     beside: dict[str, Any] = {}
     if options.rig is not None:
         beside = copied_tables(read_tables(options.rig), options.rig.parent)
-    beside["safety"] = {"stop_file": STOP_FILE} | beside.get("safety", {})
     check_outputs([options.write], rig_files(options.rig, config))
     for fault in options.fault:
         with naming("--fault"):

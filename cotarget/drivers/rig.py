@@ -2,6 +2,7 @@
 
 import contextlib
 import ipaddress
+import math
 import re
 import sys
 from collections.abc import Mapping
@@ -56,7 +57,16 @@ def _is_frame(answer: object) -> bool:
         and isinstance(answer.image, np.ndarray)
         and answer.image.dtype == np.uint8
         and answer.image.shape[2:] == (3,)
+        and isinstance(answer.t, Real)
     )
+
+
+def _is_state(answer: object, kind: type[Any], *numbers: str) -> bool:
+    return isinstance(answer, kind) and all(isinstance(getattr(answer, name), Real) for name in (*numbers, "t"))
+
+
+def _is_focal_length(answer: Any) -> bool:
+    return isinstance(answer, Real) and 0 < float(answer) < math.inf
 
 
 def _are_numbers(answer: Any, count: int) -> bool:
@@ -76,7 +86,7 @@ class Role(NamedTuple):
     methods: Mapping[str, Answer | None]  # its methods, and what they have to return; None for nothing
 
 
-FRAME = Answer(_is_frame, "a Frame, whose image is (H, W, 3) BGR of uint8")
+FRAME = Answer(_is_frame, "a Frame with its time, whose image is (H, W, 3) BGR of uint8")
 SIZE = Answer(
     lambda size: _are_two(size, Integral) and min(size) > 0,
     "(width, height) [px], a tuple of two whole numbers above zero",
@@ -89,7 +99,7 @@ ROLES: Mapping[str, Role] = {
         HeadSpec,
         {"limits": Answer(lambda limits: isinstance(limits, PanTiltLimits), "a PanTiltLimits of cotarget.rig")},
         {
-            "state": Answer(lambda answer: isinstance(answer, PanTiltState), "a PanTiltState"),
+            "state": Answer(lambda answer: _is_state(answer, PanTiltState, "pan", "tilt"), "a PanTiltState of numbers"),
             "move": Answer(lambda answer: _are_numbers(answer, 2), "pan and tilt as commanded [rad]"),
             "halt": None,
             "close": None,
@@ -102,8 +112,11 @@ ROLES: Mapping[str, Role] = {
         {
             "read": FRAME,
             "capture": FRAME,
-            "state": Answer(lambda answer: isinstance(answer, ZoomState), "a ZoomState"),
-            "zoom": Answer(lambda answer: isinstance(answer, Real), "the focal length that the lens will reach [px]"),
+            "state": Answer(
+                lambda answer: _is_state(answer, ZoomState) and _is_focal_length(answer.focal_px),
+                "a ZoomState, with a focal length above zero",
+            ),
+            "zoom": Answer(_is_focal_length, "the focal length that the lens will reach, above zero [px]"),
             "close": None,
         },
     ),
@@ -136,6 +149,8 @@ class Device:
             spec, wanted = self.settings.spec, ROLES[self.role].spec
         if not isinstance(spec, wanted):
             raise ConfigError(f"{self.where}.{KEY}: spec of its Settings is no {wanted.__name__} of cotarget.rig")
+        if wanted is UnitSpec and not (isinstance(spec.zoom, ZoomSpec) and isinstance(spec.head, HeadSpec)):
+            raise ConfigError(f"{self.where}.{KEY}: spec of its Settings is no UnitSpec of a ZoomSpec and a HeadSpec")
         return spec
 
     @property
@@ -208,29 +223,32 @@ class Device:
                 lacks = [name for name in ("zoom", "head") if not hasattr(unit, name)]
             if lacks:
                 raise self._lacking(lacks[0])
-            zoom, head = self._reporting(unit.zoom, "zoom"), self._reporting(unit.head, "head")
+            zoom, head = (self._reporting(getattr(unit, part), part, f".{part}") for part in ("zoom", "head"))
             opened.pop_all()
         return Unit(zoom, head, unit.close)
 
-    def _reporting(self, device: Any, role: str) -> Any:
-        """Check that a user's own device has what a role needs; close it if it has not."""
-        attributes, methods = ROLES[role].attributes, ROLES[role].methods
+    def _reporting(self, device: Any, role: str, part: str = "") -> Any:
+        """Check that a user's own device has what a role needs; close it if it has not, but no part of a unit."""
+        attributes, methods = ROLES[role].attributes, dict(ROLES[role].methods)
+        if part:
+            del methods["close"]
         with calling(self.where):
             lacks = [name for name in (*attributes, *methods) if not hasattr(device, name)]
         if lacks:
-            raise self._lacking(lacks[0])
+            raise self._lacking(lacks[0], part)
+        own = Reporting(device, self.where, methods)
         with contextlib.ExitStack() as opened:
-            own = opened.enter_context(contextlib.closing(Reporting(device, self.where, methods)))
+            if not part:
+                opened.enter_context(contextlib.closing(own))
             for name, answer in attributes.items():
                 check_attribute(device, name, self.where, answer)
             opened.pop_all()
         return own
 
-    def _lacking(self, name: str) -> ConfigError:
-        """Make the error for a driver that lacks a part."""
-        return ConfigError(
-            f"{self.where}.{KEY}: {self.driver.__name__} has no {name}; docs/drivers.md says what it needs"
-        )
+    def _lacking(self, name: str, part: str = "") -> ConfigError:
+        """Make the error for a driver, or a part of it, that lacks an attribute."""
+        what = f"{self.driver.__name__}{part}"
+        return ConfigError(f"{self.where}.{KEY}: {what} has no {name}; docs/drivers.md says what it needs")
 
 
 def device_of(role: str, table: Mapping[str, Any]) -> Device:

@@ -46,6 +46,8 @@ def locate_stop_file(rig: Path, backend: object, said: object) -> Path | None:
         real devices has RIG.stop beside rig.toml, or beside the file that rig.toml links to, and another rig has none.
     """
     rig = rig.absolute()
+    if isinstance(said, str) and "\0" in said:
+        raise ConfigError(f"{rig}: safety.stop_file: {said!r} is no name of a file")
     if said is None:
         if backend != "hardware":
             return None
@@ -68,7 +70,7 @@ def find_stop_file(rig: Path) -> Path:
         tables = tomllib.loads(text)
         backend, safety = tables.get("backend"), tables.get("safety")
         said = safety.get("stop_file") if isinstance(safety, dict) else None
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         lines = re.findall(STOP_FILE_LINE, text, re.MULTILINE)
         backend = "hardware" if re.search(HARDWARE_LINE, text, re.MULTILINE) else None
         said = (lines[0][1] or (False if lines[0][2] else "")) if len(lines) == 1 else None
