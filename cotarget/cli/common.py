@@ -8,6 +8,7 @@ import json
 import math
 import os
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -213,8 +214,10 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None],
             continue
         if goal.exists() and not goal.is_file():
             raise ConfigError(f"{path}: is no file, which would be replaced; name the file to write")
-        if not goal.parent.is_dir() or not os.access(goal.parent, os.W_OK):
-            raise ConfigError(f"{path}: its folder does not exist, or cannot be written to")
+        try:
+            tempfile.TemporaryFile(dir=goal.parent).close()
+        except OSError:
+            raise ConfigError(f"{path}: its folder does not exist, or cannot be written to") from None
 
 
 @contextmanager
