@@ -1,6 +1,7 @@
 """Outputs that would replace an input are refused in one line."""
 
 import os
+import tempfile
 
 import cv2
 import pytest
@@ -147,5 +148,9 @@ def test_calibration_never_replaces_a_captured_image(folder, capsys, tmp_path, n
 def test_unwritable_calibration_is_refused_before_the_session(folder, capsys, tmp_path, monkeypatch):
     monkeypatch.setitem(OPENERS, "sim", lambda config, file: pytest.fail("opened"))
     out = tmp_path / "c.json"
-    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)
+
+    def refuse(dir):
+        raise PermissionError
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
     assert str(out) in refused(capsys, *CALIBRATE, "--out", out)

@@ -290,7 +290,7 @@ def test_a_book_is_aimed_at_and_the_replay_gives_the_same(rig, capsys):
 def test_the_rig_that_is_written_can_be_stopped(rig, capsys):
     """The simulated rig's file names no stop file."""
     assert run(capsys, "stop", "--rig", rig.hardware_toml)[0] == 0
-    assert (rig.folder / "stop").exists()
+    assert rig.hardware_toml.with_suffix(".stop").exists()
     assert "emergency stop" in run(capsys, *follow(rig, "--seconds", "1"))[2]
     assert run(capsys, "clear", "--rig", rig.hardware_toml)[0] == 0
 

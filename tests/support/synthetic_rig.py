@@ -106,6 +106,8 @@ class SyntheticRig:
     the shortest one.
     """
 
+    stopped = None  # no safety layer stops it
+
     truth: Truth = field(default_factory=Truth)
     board_config: BoardConfig = field(default_factory=BoardConfig)
     seed: int = 0
