@@ -7,7 +7,6 @@ from .calibration.handeye import solve_hand_eye as solve_hand_eye
 from .config import RigConfig as RigConfig
 from .config import SimConfig as SimConfig
 from .config import TargetProfile as TargetProfile
-from .detection import Detection as Detection
 from .detection import ExternalDetector as ExternalDetector
 from .errors import CalibrationError as CalibrationError
 from .errors import ConfigError as ConfigError
@@ -20,6 +19,7 @@ from .pipeline import FollowSettings as FollowSettings
 from .pipeline import State as State
 from .pipeline import Step as Step
 from .pipeline import follow as follow
+from .rig import Detection as Detection
 from .rig import Frame as Frame
 from .rig import Rig as Rig
 from .safety.signals import handle_signals as handle_signals

@@ -16,7 +16,7 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import TargetProfile, split_name
-from cotarget.detection import Detection, Detections
+from cotarget.detection import Detections
 from cotarget.errors import ConfigError, UnreachableError
 from cotarget.estimation.motion_model import GATE
 from cotarget.estimation.zoom_matching import CloseupFinder, Expected, ZoomMeasurement
@@ -24,7 +24,7 @@ from cotarget.geometry import Array
 from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.pantilt import HeadGeometry
 from cotarget.pipeline import Step
-from cotarget.rig import Frame, Image, to_step
+from cotarget.rig import Detection, Frame, Image, to_step
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.targets import KINDS
 from cotarget.sim.targets.target import marker_of

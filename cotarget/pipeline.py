@@ -20,7 +20,7 @@ from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome, TargetSelector, candidates_of
 from cotarget.control.zoom import ZoomSettings, is_seen_well, shape_of
-from cotarget.detection import Detection, Detections, Detector, make_detector
+from cotarget.detection import Detections, Detector, make_detector
 from cotarget.detection.base import flood
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices, naming
 from cotarget.estimation import Estimate, FilterSettings
@@ -31,6 +31,7 @@ from cotarget.rig import (
     READ_TIMEOUT_S,
     Camera,
     Clock,
+    Detection,
     Frame,
     Image,
     PanTiltState,

@@ -8,11 +8,10 @@ import pytest
 
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import parse_config
-from cotarget.detection import Detection
 from cotarget.evaluation import add_row, closeup_of, decodes, observe, pointing_errors, true_calibration
 from cotarget.geometry import pose
 from cotarget.pipeline import State, Step
-from cotarget.rig import Frame
+from cotarget.rig import Detection, Frame
 from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Aim, Reach

@@ -19,7 +19,6 @@ from cotarget.detection.network import Network
 from cotarget.detection.small_target import SmallTargetDetector
 from cotarget.errors import ConfigError
 from cotarget.plugins import is_own, load, reporting
-from cotarget.rig import Detection
 
 __all__ = [
     "BIRD",
@@ -29,7 +28,6 @@ __all__ = [
     "BackgroundDetector",
     "BackgroundSettings",
     "ColorTemplateDetector",
-    "Detection",
     "Detections",
     "Detector",
     "ExternalDetector",

@@ -17,12 +17,12 @@ import numpy as np
 
 from cotarget.config import DEFAULT_TARGETS, DetectorName, TargetProfile
 from cotarget.detect_video import labelled_films
-from cotarget.detection import Detection, Detector, make_detector
+from cotarget.detection import Detector, make_detector
 from cotarget.detection.background import pieces
 from cotarget.detection.base import box_detection
 from cotarget.files import read_table
 from cotarget.pipeline import CameraRun
-from cotarget.rig import Frame, Image
+from cotarget.rig import Detection, Frame, Image
 from cotarget.track_metrics import Box, Criterion, Label, Tracked, read_labels, score_tracks
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker

@@ -20,12 +20,12 @@ from cotarget.config import TargetProfile
 from cotarget.control.controller import NO_CHANGE
 from cotarget.control.head import HeadController
 from cotarget.control.zoom import ExpectedTarget, ZoomController
-from cotarget.detection import Detection, Detector
+from cotarget.detection import Detector
 from cotarget.errors import UnreachableError
 from cotarget.estimation.motion_model import filter_settings
 from cotarget.geometry import Array
 from cotarget.pantilt import base_head, nearest, solve
-from cotarget.rig import Angles, Frame, Rig
+from cotarget.rig import Angles, Detection, Frame, Rig
 from cotarget.sim.truth import Truth
 from cotarget.tracking.track import AxisFilter, tracking_settings
 from cotarget.tracking.tracker import Tracker

@@ -13,9 +13,9 @@ from tempfile import TemporaryFile
 import numpy as np
 
 from cotarget.config import RigConfig, TargetProfile
-from cotarget.detection import Detection, Detections, make_detector
+from cotarget.detection import Detections, make_detector
 from cotarget.evaluation import microseconds
-from cotarget.rig import Camera, Frame, Image
+from cotarget.rig import Camera, Detection, Frame, Image
 from cotarget.sim.truth import CameraName
 from cotarget.sim.world import SimWorld
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from cotarget.config import TargetProfile
-from cotarget.detection import AutoDetector, BackgroundDetector, Detection, make_detector
+from cotarget.detection import AutoDetector, BackgroundDetector, make_detector
 from cotarget.detection.auto import Clutter, by_shape, fuse
 from cotarget.detection.background import LARGE
 from cotarget.pipeline import CameraRun
-from cotarget.rig import Frame
+from cotarget.rig import Detection, Frame
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 from tests.support.noise import noisy

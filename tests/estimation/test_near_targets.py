@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import Detection, Detections
+from cotarget.detection import Detections
 from cotarget.estimation import TargetFilter, filter_settings
 from cotarget.pipeline import State, follow
+from cotarget.rig import Detection
 from experiments.calibration.synthetic.rig import SIZE, Truth
 from tests.support.formula_rig import CALIBRATION, FIXED, FormulaRig
 from tests.support.moving_targets import calibration_of

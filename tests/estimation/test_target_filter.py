@@ -10,11 +10,11 @@ from scipy.interpolate import CubicSpline
 from cotarget.calibration import Calibration, Covariance
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import Detection
 from cotarget.errors import CalibrationError
 from cotarget.estimation import TargetFilter, filter_settings
 from cotarget.estimation.motion_model import MOTIONS
 from cotarget.geometry import RigidTransform
+from cotarget.rig import Detection
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import Reach, aim, depth_of, point_at
 from cotarget.tracking.track import LiveTrack, tracking_settings

@@ -11,11 +11,10 @@ from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.demo import SCENES, sim_config
-from cotarget.detection import Detection
 from cotarget.estimation.zoom_matching import CloseupFinder, Expected, look
 from cotarget.evaluation import true_calibration
 from cotarget.geometry import pose
-from cotarget.rig import Frame
+from cotarget.rig import Detection, Frame
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim

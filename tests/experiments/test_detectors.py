@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cotarget.detection import Detection, Detections
-from cotarget.rig import Frame
+from cotarget.detection import Detections
+from cotarget.rig import Detection, Frame
 from cotarget.sim.targets.random_paths import GROUPED, group_paths, in_view
 from cotarget.sim.truth import Silhouette
 from experiments.following import detectors

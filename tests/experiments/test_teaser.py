@@ -7,8 +7,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from cotarget.detection import Detection
-from cotarget.rig import Frame
+from cotarget.rig import Detection, Frame
 from experiments.paper.teaser import BOX_COLOR, WIDTH_PX, animated_webp, side_by_side
 
 RATE_HZ = 12.5

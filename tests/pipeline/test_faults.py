@@ -14,12 +14,12 @@ import pytest
 from cotarget.config import RigConfig as Config
 from cotarget.config import SafetyConfig, SimConfig
 from cotarget.control.selection import POLICIES, Chosen
-from cotarget.detection import Detection, Detections
+from cotarget.detection import Detections
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.evaluation import TruthDetector, true_calibration
 from cotarget.fusion import FusionSettings
 from cotarget.pipeline import GONE_S, STALE_S, WAIT_S, State, follow
-from cotarget.rig import READ_TIMEOUT_S, Frame
+from cotarget.rig import READ_TIMEOUT_S, Detection, Frame
 from cotarget.sim.world import SimWorld
 from tests.support.formula_rig import (
     BOOK,

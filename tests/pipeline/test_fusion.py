@@ -13,12 +13,11 @@ from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.control.selection import FirstCome, candidates_of
-from cotarget.detection import Detection
 from cotarget.estimation.zoom_matching import CloseupFinder, MatchingSettings, ZoomMeasurement
 from cotarget.fusion import FusionSettings, TargetFusion, ZoomSearch
 from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings, HeadRun
-from cotarget.rig import Frame, PanTiltState, ZoomState
+from cotarget.rig import Detection, Frame, PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker

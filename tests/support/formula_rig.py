@@ -9,10 +9,10 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import Detection, Detections
+from cotarget.detection import Detections
 from cotarget.errors import StaleFrameError
 from cotarget.pipeline import FollowSettings, follow
-from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
+from cotarget.rig import Detection, Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.motion import Axis
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth

@@ -12,8 +12,8 @@ from scipy.interpolate import CubicSpline
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import Detection
 from cotarget.pantilt import HeadGeometry
+from cotarget.rig import Detection
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from experiments.calibration.synthetic.aims import aimed
 from experiments.calibration.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Truth

@@ -16,11 +16,11 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS, RigConfig
-from cotarget.detection import Detection, Detections
+from cotarget.detection import Detections
 from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.recording.recorder import Recorder
-from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
+from cotarget.rig import Detection, Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from tests.support.rigs import guarded, rig_of
 from tests.support.simulated_clock import RigClock

@@ -4,10 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from cotarget.detection import Detection
 from cotarget.estimation.zoom_matching import ZoomMeasurement
 from cotarget.pipeline import State, Step
-from cotarget.rig import Frame, PanTiltState, ZoomState
+from cotarget.rig import Detection, Frame, PanTiltState, ZoomState
 from cotarget.targeting import Aim
 from cotarget.tracking.track import Track
 
