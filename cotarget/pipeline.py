@@ -8,7 +8,7 @@ may fail for a moment, because its lens moves, its line is slow or it reconnects
 import enum
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Real
 
 import numpy as np
@@ -23,7 +23,7 @@ from cotarget.control.zoom import ZoomSettings, is_seen_well, shape_of
 from cotarget.detection import Detections, Detector, make_detector
 from cotarget.detection.base import flood
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices, naming
-from cotarget.estimation import Estimate, FilterSettings
+from cotarget.estimation import Estimate, FilterSettings, filter_settings
 from cotarget.estimation.zoom_matching import MatchingSettings, ZoomMeasurement
 from cotarget.fusion import FusionSettings, MakeFinder, TargetFusion, ZoomSearch
 from cotarget.rig import (
@@ -548,6 +548,7 @@ class _Run:
         self._rig, self._selector = rig, selector
         self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
         self._camera = CameraRun(detector, Tracker(settings.tracking or tracking_settings(profile), rig.fixed.size))
+        settings = replace(settings, filter=settings.filter or filter_settings(profile, calibration))
         self._fusion = TargetFusion(calibration, profile, settings.filter, settings.fusion)
         self._head = HeadRun(rig, calibration, profile, selector, settings)
         self._index = 0
