@@ -82,11 +82,10 @@ class Poll(NamedTuple):
 class HeadLink(Protocol):
     """The protocol of an opened pan-tilt unit; `PolledHead` makes one call at a time.
 
-    A link is a subclass, for the halts that it need not have. It repeats what may be repeated, and ends each call in a
-    bounded time. Besides the errors named below every
-    method but `close` may raise LostError where the port failed, SilentError where the unit does not answer any more,
-    PositionLostError where its position may be lost, or another DeviceError where it cannot be used; the head is then
-    halted and closed for good.
+    A link is a subclass, and so has the methods with a default. It repeats what may be repeated, and ends each call in
+    a bounded time. Besides the errors named below every method but `close` may raise LostError where the port failed,
+    SilentError where the unit does not answer any more, PositionLostError where its position may be lost, or another
+    DeviceError where it cannot be used; the head is then halted and closed for good.
 
     Attributes:
         name: of the port, for messages.
@@ -122,7 +121,8 @@ class HeadLink(Protocol):
     def halt(self, patience: float) -> None:
         """Stop both axes; return when the unit has acknowledged it, which takes ``patience`` [s] at most.
 
-        An axis that stands keeps its goal: a servo that took its place for the goal would sag a little at each halt.
+        An axis that stands keeps its goal: a servo whose goal becomes its present position would move a little at each
+        halt.
         """
 
     def halt_last(self, patience: float) -> None:
@@ -550,7 +550,7 @@ class PolledHead:
             _refuse_too_slow("hardware.head.speed_deg_s", config.speed_deg_s, self.axes, config.port)
             _refuse_too_slow("safety.speed_deg_s", safety.speed_deg_s, self.axes, config.port)
             self._limits = _limits(self.axes, config)
-            self._goals = self._link.goals() if hasattr(self._link, "goals") else None
+            self._goals = self._link.goals()
             self._loop = Loop(self._link, clock, config.command_delay_s)
             self._wait_until_it_stands(clock)
         except BaseException as error:
@@ -617,7 +617,7 @@ class PolledHead:
     def _kept(self, goals: Sequence[int]) -> tuple[int, int]:
         """Keep the last goal of an axis that is sent to where it stands, off that goal by its slack at most.
 
-        To be sent to where it sags to, a servo would sag again.
+        A servo rests a little off each goal; sent to where it rests, it would move on by as much.
         """
         seen, kept = self._loop.snapshot, list(goals)
         for i, (goal, axis) in enumerate(zip(goals, self.axes, strict=True)):
@@ -712,8 +712,7 @@ class PolledHead:
 
 def _checked(link: HeadLink) -> HeadLink:
     """Refuse a link that lacks a part of `HeadLink`, and name the part."""
-    optional = ("hurry", "goals")
-    needed = ("name", "axes", *(name for name in vars(HeadLink) if not name.startswith("_") and name not in optional))
+    needed = ("name", "axes", *(name for name in vars(HeadLink) if not name.startswith("_")))
     if lacks := [name for name in needed if not hasattr(link, name)]:
         if "close" not in lacks:
             link.close()

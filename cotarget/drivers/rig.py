@@ -40,15 +40,14 @@ from cotarget.schema import missing_key, validate
 SWITCH_INTERVAL = 5e-4
 KEY = "driver"
 ADDRESS_KEYS = ("port", "host", "url", "address")  # of settings that say where a device is
-IPV6 = 6
 
 
-def _ip(text: str) -> int:
-    """Version of an IP address, 4 or 6; 0 for what is none."""
+def _is_ip(text: str) -> bool:
     try:
-        return ipaddress.ip_address(text).version
+        ipaddress.ip_address(text)
     except ValueError:
-        return 0
+        return False
+    return True
 
 
 def _is_frame(answer: object) -> bool:
@@ -166,9 +165,9 @@ class Device:
         for key, value in vars(self.settings).items():
             if not isinstance(value, str) or not value or (key == "port" and value.isdigit()):
                 continue
-            if (ip := _ip(value)) or key in ADDRESS_KEYS or "://" in value or value.startswith("/dev/"):
+            if (is_ip := _is_ip(value)) or key in ADDRESS_KEYS or "://" in value or value.startswith("/dev/"):
                 is_host = "://" not in value and "/" not in value and key != "port"
-                host = f"[{value}]" if ip == IPV6 else value
+                host = f"[{value}]" if is_ip and ":" in value else value  # version 6
                 found.append(f"{host}:{port}" if is_host and port else host)
         return tuple(dict.fromkeys(found))
 

@@ -10,7 +10,7 @@ import pytest
 from cotarget.config import SafetyConfig
 from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.link_errors import CutError, LostError, PositionLostError, RefusedError, SilentError
-from cotarget.drivers.polled_head import AxisFacts, Poll, PolledHead, PolledHeadSettings
+from cotarget.drivers.polled_head import AxisFacts, HeadLink, Poll, PolledHead, PolledHeadSettings
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from tests.support.emulated_camera import DEADLINE_S
 from tests.support.plants import fails, wait_for
@@ -23,7 +23,7 @@ SETTINGS |= {"speed_deg_s": 40.0, "command_delay_s": 0.0}
 EXCHANGE_S = 0.01
 
 
-class CounterLink:
+class CounterLink(HeadLink):
     """Exchange messages with a unit whose axes arrive at once."""
 
     name = "COUNTER"
