@@ -44,7 +44,8 @@ def _table(where: str, values: Any) -> Iterator[str]:
         if key.table is not None and value is not None:
             inner[f"{where}.{key.name}".lstrip(".")] = value
             continue
-        yield textwrap.indent(textwrap.fill(f"{key.meaning[:1].upper()}{key.meaning[1:]}.", WIDTH), "# ")
+        meaning = key.meaning.replace("``", "")
+        yield textwrap.indent(textwrap.fill(f"{meaning[:1].upper()}{meaning[1:]}.", WIDTH), "# ")
         yield f"#{key.name} = {form_of(key.hint) or '...' if value is None else toml_text(value)}"
     for name, value in inner.items():
         yield from _table(name, value)
