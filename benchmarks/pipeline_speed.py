@@ -25,7 +25,7 @@ from cotarget.detection import Detector, make_detector
 from cotarget.errors import ConfigError
 from cotarget.evaluation import true_calibration
 from cotarget.fusion import TargetFusion, ZoomSearch
-from cotarget.rig import Frame, PanTiltLimits
+from cotarget.rig import AxisLimits, Frame, PanTiltLimits
 from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Aim, Reach, aim
@@ -72,9 +72,9 @@ class Pipeline:
         self.fusion, self.size = TargetFusion(self.calibration, self.target), size
         self.search = ZoomSearch(self.calibration, self.target)
         spec = backends.describe(RigConfig())
-        pan, tilt = spec.head.limits.pan, spec.head.limits.tilt
+        pan, tilt = (axis.range for axis in spec.head.limits.axes)
         self.reach = Reach(pan, tilt, spec.zoom.focal_range)
-        self.limits = PanTiltLimits(pan, tilt, math.inf, math.inf, 0.0)
+        self.limits = PanTiltLimits(AxisLimits(pan, math.inf), AxisLimits(tilt, math.inf))
         self.aim: Aim | None = None  # the last one
 
     def __call__(self, frame: Frame) -> Row:

@@ -67,7 +67,9 @@ def _check_times(config: "RigConfig") -> None:
             )
 
 
-def open_rig(config: "RigConfig | Path | str", guarded: bool = True, *, file: Path | None = None) -> Rig:
+def open_rig(
+    config: "RigConfig | Path | str", guarded: bool = True, *, file: Path | None = None, partial: bool = False
+) -> Rig:
     """Open a rig with the safety layer in front of it: limits, watchdog and stop file.
 
     Args:
@@ -75,6 +77,7 @@ def open_rig(config: "RigConfig | Path | str", guarded: bool = True, *, file: Pa
         guarded: whether the safety layer is in front; without it, a caller can put a recorder between the two and call
             `cotarget.safety.safe_rig.guard` itself.
         file: the rig.toml that a configuration is from; no second program may open its real devices.
+        partial: whether real devices that are not configured may be missing, see `Rig.missing`.
 
     Raises:
         ConfigError: the configuration is malformed, or lacks a key that the rig needs.
@@ -86,30 +89,31 @@ def open_rig(config: "RigConfig | Path | str", guarded: bool = True, *, file: Pa
     if isinstance(config, str | Path):
         file = Path(config)
         config = load_config(file)
-    rig = OPENERS[config.backend](config, file)
+    rig = OPENERS[config.backend](config, file, partial)
     return guard(rig, config.safety) if guarded else rig
 
 
-def _open_simulation(config: "RigConfig", _: Path | None) -> Rig:
+def _open_simulation(config: "RigConfig", file: Path | None, partial: bool) -> Rig:
     from cotarget.sim.world import SimWorld
 
     return SimWorld(config).rig
 
 
-def _open_hardware(config: "RigConfig", file: Path | None) -> Rig:
+def _open_hardware(config: "RigConfig", file: Path | None, partial: bool) -> Rig:
     from cotarget.drivers.rig import open_hardware
 
-    return open_hardware(config, file)
+    return open_hardware(config, file, partial)
 
 
-def _open_replay(config: "RigConfig", _: Path | None) -> Rig:
+def _open_replay(config: "RigConfig", file: Path | None, partial: bool) -> Rig:
     from cotarget.recording.replay import Replay
 
     return Replay(open_recording(_recording_of(config))).rig
 
 
-# Functions that open a backend's rig, of a configuration and its rig.toml, without the safety layer.
-OPENERS: dict[str, Callable[["RigConfig", Path | None], Rig]] = {
+# Functions that open a backend's rig without the safety layer; arguments: configuration, rig.toml, whether devices may
+# be missing.
+OPENERS: dict[str, Callable[["RigConfig", Path | None, bool], Rig]] = {
     "sim": _open_simulation,
     "hardware": _open_hardware,
     "replay": _open_replay,

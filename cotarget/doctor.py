@@ -221,12 +221,12 @@ def _position(config: "RigConfig", port: str, rig: Path) -> Finding:
 def _devices(config: "RigConfig", rig: Path) -> list[Finding]:
     """Ask each device for its identity."""
     from cotarget.drivers import board
-    from cotarget.drivers.rig import board_settings, devices, port_of
+    from cotarget.drivers.rig import board_settings, devices
 
     found, presenter = devices(config.hardware), board_settings(config.hardware)
     return [
-        _position(config, port_of(found["head"]), rig),
-        *(_ask(device.where, device.probe, port_of(device), rig) for device in found.values()),
+        _position(config, found["head"].address, rig),
+        *(_ask(device.where, device.probe, device.address, rig) for device in found.values()),
         _ask("hardware.board", lambda: board.probe(presenter), presenter.presenter, rig),
     ]
 

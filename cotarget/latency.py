@@ -28,13 +28,13 @@ from cotarget.config import BoardConfig
 from cotarget.control.controller import reach_of
 from cotarget.errors import CalibrationError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, pose
-from cotarget.rig import Camera, Frame, Image, PanTiltLimits, PanTiltState, Rig, refuse_outside
+from cotarget.rig import AxisLimits, Camera, Frame, Image, PanTiltState, Rig, refuse_outside
 from cotarget.targeting import aim
 
 GROWTH = 2.0  # zoom factor of a measurement, or the lens's whole range; less than LEAST_GROWTH measures nothing
 LEAST_GROWTH = 1.1
 WAYS = 6  # number of ways, in and out alternately
-BEFORE_S, AFTER_S = 0.5, 0.5  # frames are kept from this long before a command to this long after the lens stands [s]
+BEFORE_S, AFTER_S = 0.5, 1.2  # frames are kept from this long before a command to this long after the lens stands [s]
 # Part of a way, in the logarithm of the scale, from which its start is extrapolated: beyond the corners' noise, and
 # before most of the way, because no lens travels evenly all the way.
 FIRST, LAST = 0.08, 0.5
@@ -181,10 +181,10 @@ def _moving_frames(rig: Rig, before: Sequence[Frame]) -> list[Frame]:
 
 WIGGLE = np.radians(1.5)  # motion of the head, some 18 px of a usual wide lens [rad]
 # Times between turns [s]: no multiples of usual frame periods, so that frames fall on all parts of the motion.
-TURNS_EVERY = (0.53, 0.47, 0.61)
-WIGGLE_SECONDS, SWING_SECONDS = 8.0, 10.0
+TURNS_EVERY = (1.33, 1.17, 1.51)
+WIGGLE_SECONDS, SWING_SECONDS = 12.0, 10.0
 LOOK = 0.01  # longest wait for a frame before the head's state is read again [s]
-LONGEST_DELAY = 0.6  # largest delay searched, of either sign [s]
+LONGEST_DELAY = 1.1  # largest delay searched, of either sign [s]
 COARSE = 0.01  # step of the coarse search [s]
 FEWEST = 20  # fewest samples of a motion
 AGREEMENT = 0.9  # least correlation of two records
@@ -237,7 +237,7 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     refuse_outside(home, rig.head.limits)
     _zoom_out(rig)
     pan, tilt = home.pan, home.tilt
-    low, high = rig.head.limits.pan
+    low, high = rig.head.limits.pan.range
     way = WIGGLE if pan + WIGGLE <= high else -WIGGLE
     times: list[float] = []
     shifts: list[float] = []
@@ -271,7 +271,7 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
         )
         raise CalibrationError(late or unmoved)
     try:
-        command = command_delay(starts, states, rig.head.limits)
+        command = command_delay(starts, states, rig.head.limits.pan)
     except CalibrationError as error:
         raise CalibrationError(late or str(error)) from None
     return HeadLatency(zoom, command, len(times), late)
@@ -383,17 +383,17 @@ class HorizontalShift:
 
 
 def command_delay(
-    starts: Sequence[tuple[float, float, float]], states: Sequence[PanTiltState], limits: PanTiltLimits
+    starts: Sequence[tuple[float, float, float]], states: Sequence[PanTiltState], axis: AxisLimits
 ) -> float:
     """Delay from a command to the start of the motion that follows, median over all commands [s].
 
     An axis that starts at t0 has gone acceleration / 2 (t - t0)^2 at t while it accelerates, so each report in the
-    first part of the way gives t0.
+    first part of the way gives t0, and several give the acceleration.
 
     Args:
         starts: for each command its time [s], and the axis's start and goal [rad].
         states: reports of the head.
-        limits: acceleration of the axis, and its slack, within which it may tremble where it stands.
+        axis: acceleration of pan, measured too if it is unknown, and the slack within which it may tremble.
 
     Returns:
         The delay; nan if no report fell into the early part of any turn.
@@ -401,23 +401,25 @@ def command_delay(
     Raises:
         CalibrationError: the head accelerates otherwise, so that its motion does not give the time of its start.
     """
-    acceleration = limits.acceleration
     times = np.array([state.t for state in states])
     pans = np.array([state.pan for state in states])
-    found, slopes = [], []
+    seen, slopes = [], []  # per command: its time, times of early reports, and sqrt(acceleration) (t - t0) for each
     for (t, before, goal), (until, *_) in zip(starts, [*starts[1:], (np.inf, 0.0, 0.0)], strict=True):
         gone = np.abs(pans - before)
-        early = (times > t) & (times < until) & (gone > limits.slack) & (gone < EARLY * abs(goal - before))
-        since = np.sqrt(2 * gone[early] / acceleration)
+        early = (times > t) & (times < until) & (gone > axis.slack) & (gone < EARLY * abs(goal - before))
+        roots = np.sqrt(2 * gone[early])
         if early.any():
-            found.append(float(np.median(times[early] - since)) - t)
-        if len(np.unique(since)) >= FEWEST_REPORTS:
-            slopes.append(np.polyfit(times[early], since, 1)[0])  # 1 where the acceleration is right
-    if slopes and not 1 / MISFIT <= (ratio := np.median(slopes) ** 2) <= MISFIT:
+            seen.append((t, times[early], roots))
+        if len(np.unique(roots)) >= FEWEST_REPORTS:
+            slopes.append(np.polyfit(times[early], roots, 1)[0])
+    measured = float(np.median(slopes) ** 2) if slopes else np.nan
+    acceleration = measured if axis.acceleration is None else axis.acceleration
+    if slopes and not 1 / MISFIT <= measured / acceleration <= MISFIT:
         raise CalibrationError(
             f"the motion of the head does not fit its acceleration of {np.degrees(acceleration):.0f} degrees/s^2, but "
-            f"one of some {np.degrees(ratio * acceleration):.0f}; correct the head's limits"
+            f"one of some {np.degrees(measured):.0f}; correct the head's limits"
         )
+    found = [np.median(reported - roots / np.sqrt(acceleration)) - t for t, reported, roots in seen]
     return float(np.median(found)) if found else np.nan
 
 

@@ -73,12 +73,21 @@ class ZoomState:
 
 @dataclass(frozen=True)
 class PanTiltState:
-    """State that the head reports: angles [rad], whether it moves, and the time of this state [s]."""
+    """State that the head reports.
+
+    Attributes:
+        pan: angle [rad].
+        tilt: angle [rad].
+        moving: whether it moves; true until the head is known to stand.
+        t: time of this state [s].
+        sigma: standard deviation of either angle, beyond that of a step [rad].
+    """
 
     pan: float
     tilt: float
     moving: bool
     t: float
+    sigma: float = 0.0
 
 
 def to_step(angle: float, step: float) -> float:
@@ -86,30 +95,80 @@ def to_step(angle: float, step: float) -> float:
     return round(angle / step) * step if step else angle
 
 
+STEP_ROUNDING = 1e-9  # in steps; keeps a limit of whole steps whole after its conversion from degrees
+
+
 @dataclass(frozen=True)
-class PanTiltLimits:
-    """Limits of a pan-tilt unit.
+class AxisLimits:
+    """Limits of one axis of a head.
 
     Attributes:
-        pan: lowest and highest pan [rad].
-        tilt: lowest and highest tilt [rad].
-        speed: highest speed of either axis [rad/s].
-        acceleration: acceleration of either axis [rad/s^2].
-        step: resolution of either axis [rad]; 0 for a continuous head.
-        slack: angle by which either axis may rest off its goal, as a servo does [rad].
+        range: lowest and highest angle [rad].
+        speed: highest speed [rad/s]; inf for an axis that jumps.
+        acceleration: [rad/s^2]; None if unknown.
+        step: resolution [rad]; 0 for a continuous axis.
+        slack: angle by which the axis may rest off its goal, as a servo does [rad].
     """
 
-    pan: tuple[float, float]
-    tilt: tuple[float, float]
+    range: tuple[float, float]
     speed: float
-    acceleration: float
-    step: float
+    acceleration: float | None = None
+    step: float = 0.0
     slack: float = 0.0
 
     @property
     def tolerance(self) -> float:
         """Angle by which an axis that has arrived may be off its goal [rad]."""
         return self.step + self.slack
+
+    @property
+    def assumed_acceleration(self) -> float:
+        """Acceleration for predictions [rad/s^2]: inf, so full speed at once, if it is unknown."""
+        return math.inf if self.acceleration is None else self.acceleration
+
+    @property
+    def braking_s(self) -> float:
+        """Longest time to come to rest [s]; 0 if the acceleration is unknown."""
+        return 0.0 if math.isinf(self.assumed_acceleration) else self.speed / self.assumed_acceleration
+
+    def travel_s(self, way: float) -> float:
+        """Travel time from rest to rest over an angle [rad] at full speed [s]."""
+        way, acceleration = abs(way), self.assumed_acceleration
+        if math.isinf(acceleration):  # full speed at once, or a jump
+            return way / self.speed
+        if way * acceleration <= self.speed**2:  # it does not reach full speed
+            return 2 * math.sqrt(way / acceleration)
+        return way / self.speed + self.speed / acceleration
+
+    def beyond(self, angle: float) -> float:
+        """Angle by which an angle is outside of the range, negative inside of it [rad]; nan for nan."""
+        return max(self.range[0] - angle, angle - self.range[1])
+
+    def outermost(self) -> tuple[float, float]:
+        """Outermost steps inside the range [rad]; its ends for an axis without steps."""
+        low, high = self.range
+        if not self.step > 0:
+            return low, high
+        first, last = math.ceil(low / self.step - STEP_ROUNDING), math.floor(high / self.step + STEP_ROUNDING)
+        return first * self.step, last * self.step
+
+    def clip(self, angle: float) -> float:
+        """Clip an angle [rad] to the outermost steps inside the range, so that rounding cannot lead outside."""
+        low, high = self.outermost()
+        return min(max(angle, low), high)
+
+
+@dataclass(frozen=True)
+class PanTiltLimits:
+    """Limits of the axes of a pan-tilt unit."""
+
+    pan: AxisLimits
+    tilt: AxisLimits
+
+    @property
+    def axes(self) -> tuple[AxisLimits, AxisLimits]:
+        """Limits of pan and of tilt."""
+        return self.pan, self.tilt
 
     def capped(self, speed: Speed | None) -> tuple[float, float]:
         """Limit the speeds of pan and tilt to the highest [rad/s]; None stands for the highest.
@@ -118,16 +177,29 @@ class PanTiltLimits:
             DeviceError: a speed is not above zero.
         """
         capped = []
-        for each in speed if isinstance(speed, tuple) else (speed, speed):
+        for each, axis in zip(speed if isinstance(speed, tuple) else (speed, speed), self.axes, strict=True):
             if each is not None and not each > 0:
                 raise DeviceError(f"the head cannot move at a speed of {each} rad/s")
-            capped.append(self.speed if each is None else min(each, self.speed))
+            capped.append(axis.speed if each is None else min(each, axis.speed))
         return capped[0], capped[1]
+
+    def clip(self, pan: float, tilt: float) -> tuple[float, float]:
+        """Clip angles [rad] as `AxisLimits.clip` does.
+
+        Raises:
+            DeviceError: an angle is not finite.
+        """
+        if not (math.isfinite(pan) and math.isfinite(tilt)):
+            raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
+        return self.pan.clip(pan), self.tilt.clip(tilt)
 
     def allow(self, pan: npt.ArrayLike, tilt: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Whether angles [rad] are within the limits; nan is not."""
-        pan, tilt = np.asarray(pan, dtype=float), np.asarray(tilt, dtype=float)
-        return np.asarray((pan >= self.pan[0]) & (pan <= self.pan[1]) & (tilt >= self.tilt[0]) & (tilt <= self.tilt[1]))
+        within = [
+            (np.asarray(angles, dtype=float) >= axis.range[0]) & (np.asarray(angles, dtype=float) <= axis.range[1])
+            for angles, axis in zip((pan, tilt), self.axes, strict=True)
+        ]
+        return np.asarray(within[0] & within[1])
 
 
 def refuse_outside(state: PanTiltState, limits: PanTiltLimits, axes: Sequence[str] = ("pan", "tilt")) -> None:
@@ -136,14 +208,14 @@ def refuse_outside(state: PanTiltState, limits: PanTiltLimits, axes: Sequence[st
     Raises:
         DeviceError: an axis is beyond its limits by more than its tolerance.
     """
-    for axis in axes:
-        angle, (low, high) = getattr(state, axis), getattr(limits, axis)
-        if not low - limits.tolerance <= angle <= high + limits.tolerance:
-            inside = math.degrees(min(max(angle, low), high))
+    for name in axes:
+        angle, axis = getattr(state, name), getattr(limits, name)
+        if not axis.beyond(angle) <= axis.tolerance:
+            low, high = map(math.degrees, axis.range)
             raise DeviceError(
-                f"the head stands at {axis} {math.degrees(angle):.1f} degrees, beyond the limits of "
-                f"{math.degrees(low):.1f} to {math.degrees(high):.1f}, and would move inside; if it may, do so first "
-                f"by cotarget point --{axis}-deg {inside:.1f}"
+                f"the head stands at {name} {math.degrees(angle):.1f} degrees, beyond the limits of "
+                f"{low:.1f} to {high:.1f}, and would move inside; if it may, do so first "
+                f"by cotarget point --{name}-deg {min(max(math.degrees(angle), low), high):.1f}"
             )
 
 
@@ -168,15 +240,15 @@ class ZoomSpec(CameraSpec):
 
     Attributes:
         focal_range: shortest and longest nominal focal length [px].
-        pitch_mm: nominal size of a pixel of the stream [mm].
         still_size: (width, height) of full stills [px]; that of the stream if the device has no separate stills.
         delay_s: time from a command to the start of the lens's motion [s].
+        pitch_mm: nominal size of a pixel of the stream [mm]; None if unknown, and with it the lens's millimetres.
     """
 
     focal_range: tuple[float, float]
-    pitch_mm: float
     still_size: tuple[int, int]
     delay_s: float
+    pitch_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -347,6 +419,7 @@ class Rig(AbstractContextManager["Rig", None]):
         release: halts the head and releases the devices; may be called again.
         config: the configuration that the rig was opened from; None if it was made in another way.
         guard: the safety layer, see `cotarget.safety.safe_rig.guard`; None for a rig without one.
+        missing: devices that rig.toml does not configure, of "fixed", "zoom" and "head"; using one is a ConfigError.
     """
 
     fixed: Camera
@@ -358,6 +431,7 @@ class Rig(AbstractContextManager["Rig", None]):
     release: Callable[[], None]
     config: "RigConfig | None" = None
     guard: Guard | None = None
+    missing: frozenset[str] = frozenset()
 
     def stop(self, reason: str) -> None:
         """Emergency stop: halt the head, and refuse every move until `clear`; may be called from any thread.

@@ -41,14 +41,14 @@ class Reach:
         tilt: lowest and highest tilt [rad].
         focal_px: shortest and longest nominal focal length [px].
         now: pan and tilt of the head now [rad].
-        step: resolution of the head [rad].
+        steps: resolution of pan and of tilt [rad].
     """
 
     pan: tuple[float, float]
     tilt: tuple[float, float]
     focal_px: tuple[float, float]
     now: tuple[float, float] = (0.0, 0.0)
-    step: float = 0.0
+    steps: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ def error_budget(
 
     depth = found.depth
     parts = {
-        "steps": reach.step * ROUNDED * float(np.hypot(1.0, np.cos(found.tilt))),
+        "steps": ROUNDED * float(np.hypot(reach.steps[1], reach.steps[0] * np.cos(found.tilt))),
         "pixel": float(np.hypot(moved(ROUNDED, 0.0, depth), moved(0.0, ROUNDED, depth))),
     }
     if size_px is not None:

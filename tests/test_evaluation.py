@@ -47,7 +47,7 @@ def book():
 
 def reach_of(world):
     limits = world.rig.head.limits
-    return Reach(limits.pan, limits.tilt, world.rig.zoom.focal_range)
+    return Reach(limits.pan.range, limits.tilt.range, world.rig.zoom.focal_range)
 
 
 def test_the_true_calibration_points_exactly(book):
@@ -226,7 +226,7 @@ def test_each_frame_is_compared_with_the_truth_at_its_own_time(moving):
 
 def test_a_row_holds_the_true_angles_of_the_head(moving):
     pan, tilt = moving.rig.head.move(0.1, -0.2, wait=True)
-    assert (pan, tilt) == pytest.approx((0.1, -0.2), abs=moving.rig.head.limits.step)
+    assert (pan, tilt) == pytest.approx((0.1, -0.2), abs=moving.rig.head.limits.pan.step)
     row = row_of(moving)
     assert (row.pan_deg, row.tilt_deg) == pytest.approx((math.degrees(pan), math.degrees(tilt)))
 

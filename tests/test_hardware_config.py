@@ -65,4 +65,4 @@ def test_the_drivers_describe_their_devices():
     spec = describe(parse_config(tomllib.loads('backend = "hardware"\nhardware.head.pan_deg = [-90, 90]')))
     assert spec.zoom.focal_range == pytest.approx((6 / 0.01794, 72 / 0.01794))
     assert (spec.fixed.size, spec.zoom.size) == ((704, 576), (320, 240))
-    assert spec.head.limits.pan == pytest.approx((-1.5707963, 1.5707963))
+    assert spec.head.limits.pan.range == pytest.approx((-1.5707963, 1.5707963))

@@ -22,8 +22,9 @@ import numpy as np
 from helper import GREY
 from cotarget.errors import ConfigError
 from cotarget.rig import CameraSpec, Frame, HeadSpec, PanTiltLimits, PanTiltState, UnitSpec, ZoomSpec, ZoomState
+from tests.support.rigs import alike
 
-LIMITS = PanTiltLimits((-1.0, 1.0), (-0.5, 0.5), 2.0, 4.0, 0.0)
+LIMITS = alike((-1.0, 1.0), (-0.5, 0.5), 2.0, 4.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ def test_rig_of_own_devices_is_opened_from_rig_toml(rig, monkeypatch):
     with open_rig(rig) as opened:
         assert opened.fixed.read().image[0, 0].tolist() == [128] * 3
         assert opened.head.move(math.radians(10), 0.0, wait=True)[0] == pytest.approx(math.radians(10))
-        assert opened.spec.head.limits.pan == (-1.0, 1.0)
+        assert opened.spec.head.limits.pan.range == (-1.0, 1.0)
 
 
 def test_commands_and_doctor_use_own_devices(rig, capsys, monkeypatch):

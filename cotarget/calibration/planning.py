@@ -275,7 +275,7 @@ def plan_poses(
     middle = (head.T_base_fixed * T_fixed_board).apply(board_points(board).mean(axis=0))
     ray = lens.ray(lens.image_center_px)
     try:
-        centred = nearest(solve(middle, head.hand_eye(), head.axes, ray), limits.pan, limits.tilt)
+        centred = nearest(solve(middle, head.hand_eye(), head.axes, ray), limits.pan.range, limits.tilt.range)
     except UnreachableError:
         return []
     reach = np.arctan(np.hypot(*lens.size) / 2 / lens.focal_px[0])

@@ -4,7 +4,6 @@ A rig whose zoom camera streams only a small preview records full stills instead
 """
 
 import logging
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -279,13 +278,14 @@ def wait_for_head(rig: Rig, wanted: tuple[float, float], way: float) -> tuple[Pa
     Returns the head's state, and True if it has arrived.
     """
     head, clock = rig.head, rig.clock
-    limits = head.limits
-    braking_s = 0.0 if math.isinf(limits.acceleration) else limits.speed / limits.acceleration
-    deadline = clock.now() + way / limits.speed + braking_s + HEAD_PATIENCE
+    axes = head.limits.axes
+    deadline = clock.now() + max(way / axis.speed + axis.braking_s for axis in axes) + HEAD_PATIENCE
     while True:
         state = head.state()
-        off = max(abs(state.pan - wanted[0]), abs(state.tilt - wanted[1]))
-        arrived = not state.moving and off <= limits.tolerance + POSE_TOLERANCE
+        arrived = not state.moving and all(
+            abs(angle - goal) <= axis.tolerance + POSE_TOLERANCE
+            for angle, goal, axis in zip((state.pan, state.tilt), wanted, axes, strict=True)
+        )
         if arrived or clock.now() > deadline:
             return state, arrived
         if (reason := rig.stopped) is not None:
@@ -301,9 +301,8 @@ def with_stills(rig: Rig) -> Rig:
     if rig.zoom.still_size == rig.zoom.size:
         return rig
     zoom, factor = StillCamera(rig.zoom, rig.clock), rig.zoom.still_size[0] / rig.zoom.size[0]
-    spec = replace(
-        rig.spec.zoom, size=zoom.size, focal_range=zoom.focal_range, pitch_mm=rig.spec.zoom.pitch_mm / factor
-    )
+    pitch_mm = rig.spec.zoom.pitch_mm and rig.spec.zoom.pitch_mm / factor
+    spec = replace(rig.spec.zoom, size=zoom.size, focal_range=zoom.focal_range, pitch_mm=pitch_mm)
     return replace(rig, zoom=zoom, spec=replace(rig.spec, zoom=spec))
 
 

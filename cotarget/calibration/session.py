@@ -270,7 +270,8 @@ def _centred(recorder: CaptureRecorder, view: View, by_pan: View, by_tilt: View)
     J = np.stack([(at_pan - middle) / (by_pan.pan - view.pan), (at_tilt - middle) / (by_tilt.tilt - view.tilt)], axis=1)
     d_pan, d_tilt = np.linalg.lstsq(J, off, rcond=None)[0]
     limits = recorder.rig.head.limits
-    recorder.turn(float(np.clip(view.pan + d_pan, *limits.pan)), float(np.clip(view.tilt + d_tilt, *limits.tilt)))
+    pan, tilt = np.clip(view.pan + d_pan, *limits.pan.range), np.clip(view.tilt + d_tilt, *limits.tilt.range)
+    recorder.turn(float(pan), float(tilt))
     return recorder.see_zoom(expected=False) or view
 
 

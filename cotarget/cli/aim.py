@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from cotarget.cli.common import add_file, add_insist, check_within, load_plausible, positive, print_json
+from cotarget.cli.common import add_file, add_insist, focal_px_of, load_plausible, positive, print_json
 from cotarget.errors import ConfigError, naming
 
 if TYPE_CHECKING:
@@ -66,19 +66,18 @@ def run(options: argparse.Namespace) -> None:
     if options.rig is None:  # without a rig.toml, the calibration gives the shortest focal length
         shortest = calibration.zoom_head.lens.nominal_px[0]
     limits = spec.head.limits
-    reach = Reach(limits.pan, limits.tilt, (shortest, max(shortest, longest)), step=limits.step)
+    steps = (limits.pan.step, limits.tilt.step)
+    reach = Reach(limits.pan.range, limits.tilt.range, (shortest, max(shortest, longest)), steps=steps)
     wanted, nominal = None, None
     if target is not None and options.focal_mm is None:
         wanted = WantedSize(target.size, options.wanted_px or target.wanted_px, target.is_vertical())
     if options.focal_mm is not None:
-        bounds = reach.focal_px[0] * pitch_mm, reach.focal_px[1] * pitch_mm
-        check_within("--focal-mm", options.focal_mm, bounds, "the lens's {} mm")
-        nominal = options.focal_mm / pitch_mm
+        nominal = focal_px_of(options.focal_mm, pitch_mm, reach.focal_px)
     point = point_at(calibration, pixel, depth)
     found = aim(calibration, point, reach, wanted_size=wanted, nominal_px=nominal, method=options.ik)
     # The error budget holds for the exact inverse; the shortcut's additional error is not modelled.
     budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
-    is_calibrated = _check_focal_length(calibration, found, pitch_mm)
+    is_calibrated = _check_focal_length(calibration, found)
     targets = config.targets if target is None else {options.target: target}
     is_plausible = _check_depth(options, calibration, found, targets)
     if wanted is not None and found.limited:
@@ -88,7 +87,7 @@ def run(options: argparse.Namespace) -> None:
             "pan_deg": math.degrees(found.pan),
             "tilt_deg": math.degrees(found.tilt),
             "focal_px": found.focal_px,
-            "focal_mm": found.nominal_px * pitch_mm,
+            "focal_mm": pitch_mm and found.nominal_px * pitch_mm,
             "focal_limited": found.limited,
             "focal_calibrated": is_calibrated,
             "depth_m": found.depth,
@@ -100,7 +99,7 @@ def run(options: argparse.Namespace) -> None:
     )
 
 
-def _check_focal_length(calibration: "Calibration", found: "Aim", pitch_mm: float) -> bool:
+def _check_focal_length(calibration: "Calibration", found: "Aim") -> bool:
     """Whether an aim's focal length is among those calibrated; warn if not."""
     from cotarget.calibration.zoom_samples import SAME_FOCAL
 
@@ -109,8 +108,8 @@ def _check_focal_length(calibration: "Calibration", found: "Aim", pitch_mm: floa
     if shortest * (1 - SAME_FOCAL) <= found.nominal_px <= longest * (1 + SAME_FOCAL):
         return True
     _warn(
-        f"{found.nominal_px * pitch_mm:.1f} mm is outside the calibrated focal lengths, {shortest * pitch_mm:.1f} to "
-        f"{longest * pitch_mm:.1f} mm: the aim is extrapolated"
+        f"a nominal focal length of {found.nominal_px:.0f} px is outside the calibrated ones, {shortest:.0f} to "
+        f"{longest:.0f} px: the aim is extrapolated"
     )
     return False
 

@@ -40,12 +40,12 @@ def load_plausible(path: Path, spec: "RigSpec | None" = None, *, insist: bool) -
     return calibration
 
 
-def open_named(path: Path, config: "RigConfig", guarded: bool = True) -> "Rig":
+def open_named(path: Path, config: "RigConfig", guarded: bool = True, partial: bool = False) -> "Rig":
     """Open the rig of a rig.toml, as `open_rig` does; the message of a ConfigError names the file."""
     from cotarget.backends import open_rig
 
     with naming(path):
-        return open_rig(config, guarded, file=path)
+        return open_rig(config, guarded, file=path, partial=partial)
 
 
 def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:
@@ -279,6 +279,18 @@ def check_within(option: str, value: float, bounds: tuple[float, float], whose: 
     low, high = bounds
     if not low - slack <= value <= high + slack:
         raise ConfigError(f"{option}: {value:g} is beyond {whose.format(f'{low:g} to {high:g}')}")
+
+
+def focal_px_of(focal_mm: float, pitch_mm: float | None, bounds_px: tuple[float, float]) -> float:
+    """Convert the value of --focal-mm to a nominal focal length [px] within the lens's bounds [px].
+
+    Raises:
+        ConfigError: the pixel's size is unknown, or the lens does not have that focal length.
+    """
+    if pitch_mm is None:
+        raise ConfigError("--focal-mm: needs the size of a pixel; give pitch_mm in the zoom camera's table of rig.toml")
+    check_within("--focal-mm", focal_mm, (bounds_px[0] * pitch_mm, bounds_px[1] * pitch_mm), "the lens's {} mm")
+    return focal_mm / pitch_mm
 
 
 def number(text: str) -> float:

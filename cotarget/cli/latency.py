@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> None:
         calibration.zoom_head.hand_eye()
         check_board_size(options.rig, config)
     where = "sim" if config.backend == "sim" else "hardware"
-    with open_named(options.rig, config) as rig:
+    with open_named(options.rig, config, partial=True) as rig:
         head = measure_head(rig)
         found = {
             f"{where}.zoom.latency_s": rig.spec.zoom.latency_s + head.zoom.seconds,

@@ -2,12 +2,15 @@
 
 import argparse
 import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from cotarget.cli.common import (
     add_file,
     add_rig,
     check_outputs,
     check_within,
+    focal_px_of,
     number,
     open_named,
     positive,
@@ -17,6 +20,9 @@ from cotarget.cli.common import (
 )
 from cotarget.cli.where import position
 from cotarget.errors import ConfigError, DeviceError
+
+if TYPE_CHECKING:
+    from cotarget.rig import Rig
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +40,6 @@ def run(options: argparse.Namespace) -> None:
     from cotarget.backends import load_config
     from cotarget.calibration.captures import write_image
     from cotarget.calibration.recorder import wait_for_head, wait_for_lens
-    from cotarget.rig import refuse_outside
     from cotarget.safety.stop_file import refuse_if_stopped
 
     config = load_config(options.rig)
@@ -43,35 +48,49 @@ def run(options: argparse.Namespace) -> None:
     check_outputs(shots.values(), rig_files(options.rig, config))
     if config.backend == "replay":
         raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's head and lens cannot be sent anywhere")
-    with open_named(options.rig, config) as rig:
-        limits = rig.head.limits
-        for option, angle, bounds in (
-            ("--pan-deg", options.pan_deg, limits.pan),
-            ("--tilt-deg", options.tilt_deg, limits.tilt),
-        ):
-            if angle is not None:
-                low, high = map(math.degrees, bounds)
-                check_within(option, angle, (low, high), "the head's {} degrees", math.degrees(limits.step))
-        now, asked = rig.head.state(), {"pan": options.pan_deg, "tilt": options.tilt_deg}
-        moves = any(angle is not None for angle in asked.values())
-        if moves:
-            refuse_outside(now, limits, [axis for axis, angle in asked.items() if angle is None])
+    asked = {"pan": options.pan_deg, "tilt": options.tilt_deg}
+    with open_named(options.rig, config, partial=True) as rig:
+        if moves := any(angle is not None for angle in asked.values()):
+            goal = _goal(rig, asked)
         if options.focal_mm is not None:
-            shortest, longest = (focal * rig.spec.zoom.pitch_mm for focal in rig.zoom.focal_range)
-            check_within("--focal-mm", options.focal_mm, (shortest, longest), "the lens's {} mm")
-            rig.zoom.zoom(options.focal_mm / rig.spec.zoom.pitch_mm)
-        if moves:  # an axis that is not asked for is sent to where it stands
-            pan, tilt = (getattr(now, axis) if angle is None else math.radians(angle) for axis, angle in asked.items())
-            goal = rig.head.move(pan, tilt, wait=True)
+            rig.zoom.zoom(focal_px_of(options.focal_mm, rig.spec.zoom.pitch_mm, rig.zoom.focal_range))
+        if moves:
+            now = rig.head.state()
+            goal = rig.head.move(*goal, wait=True)
             if not wait_for_head(rig, goal, max(abs(goal[0] - now.pan), abs(goal[1] - now.tilt)))[1]:
                 raise DeviceError(
                     "the head does not stand where it was sent: see that nothing is in its way and that its driver "
                     "reports where it is"
                 )
-        wait_for_lens(rig)
-        head, lens = rig.head.state(), rig.zoom.state()
+        if "zoom" not in rig.missing:
+            wait_for_lens(rig)
+        said, shots = position(rig), {name: path for name, path in shots.items() if name not in rig.missing}
+        stands_t = rig.clock.now() if "head" in rig.missing else rig.head.state().t
         for name, path in shots.items():
-            frame = rig.fixed.read(newer_than=head.t) if name == "fixed" else rig.zoom.capture()
+            frame = rig.fixed.read(newer_than=stands_t) if name == "fixed" else rig.zoom.capture()
             with previous_kept(path):
                 write_image(path, frame.image)
-    print_json(position(rig, head, lens) | {"pictures": {name: str(path) for name, path in shots.items()}})
+    print_json(said | {"pictures": {name: str(path) for name, path in shots.items()}})
+
+
+def _goal(rig: "Rig", asked: Mapping[str, float | None]) -> tuple[float, float]:
+    """Return pan and tilt to command [rad]; an axis that is not asked for is sent to where it stands.
+
+    Args:
+        rig: the rig.
+        asked: the angles asked for [degrees].
+
+    Raises:
+        ConfigError: an angle is beyond the head's limits.
+        DeviceError: an axis that is not asked for stands beyond them.
+    """
+    from cotarget.rig import refuse_outside
+
+    now, goal = rig.head.state(), []
+    refuse_outside(now, rig.head.limits, [axis for axis, angle in asked.items() if angle is None])
+    for (name, angle), axis in zip(asked.items(), rig.head.limits.axes, strict=True):
+        if angle is not None:
+            low, high = map(math.degrees, axis.range)
+            check_within(f"--{name}-deg", angle, (low, high), "the head's {} degrees", math.degrees(axis.step))
+        goal.append(getattr(now, name) if angle is None else math.radians(angle))
+    return goal[0], goal[1]

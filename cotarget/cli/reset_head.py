@@ -25,7 +25,7 @@ def run(options: argparse.Namespace) -> None:
     """Reset the pan-tilt unit after consent."""
     from cotarget.backends import load_config
     from cotarget.drivers.clock import MonotonicClock
-    from cotarget.drivers.interlock import rig_lock
+    from cotarget.drivers.interlock import addresses_of, rig_lock
     from cotarget.drivers.rig import devices
     from cotarget.safety.signals import end_politely
     from cotarget.safety.stop_file import StopLook, refuse_if_stopped
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
     _ask(options, "The head will turn through its whole range. Are camera and cables clear of it?")
     look, undo = StopLook(config.safety.stop_file), end_politely()
     try:
-        with rig_lock(*head.addresses, file=options.rig):
+        with rig_lock(*addresses_of(head.settings), file=options.rig):
             done = head.driver.reset(head.settings, MonotonicClock(), config.safety, look.reason)
     finally:
         undo()
@@ -53,9 +53,8 @@ def run(options: argparse.Namespace) -> None:
 def _trust_position(options: argparse.Namespace, config: "RigConfig", head: "Device") -> None:
     """Remove the position-lost marker of a unit without a reset after consent."""
     from cotarget.drivers.interlock import PositionLostMarker
-    from cotarget.drivers.rig import port_of
 
-    lost = PositionLostMarker(port_of(head), config.safety.stop_file)
+    lost = PositionLostMarker(head.address, config.safety.stop_file)
     if not lost.files():
         raise ConfigError(f"{options.rig}: the driver of {head.where} has no reset; the unit needs none")
     _ask(options, "The unit has no reset; switch it off and on. Does it stand where it reports?")

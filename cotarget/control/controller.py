@@ -199,4 +199,5 @@ class Controller:
 def reach_of(rig: Rig, state: PanTiltState | None = None) -> Reach:
     """Collect the limits of a rig's head and lens, and where the head is; by default its state is read."""
     limits, head = rig.head.limits, rig.head.state() if state is None else state
-    return Reach(limits.pan, limits.tilt, rig.zoom.focal_range, (head.pan, head.tilt), limits.step)
+    steps = (limits.pan.step, limits.tilt.step)
+    return Reach(limits.pan.range, limits.tilt.range, rig.zoom.focal_range, (head.pan, head.tilt), steps)

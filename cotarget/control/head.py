@@ -127,11 +127,10 @@ class HeadModel:
 
     def _is_near(self, state: PanTiltState, motion: Motion) -> bool:
         """Whether a report agrees with a predicted position."""
-        coarse = max(self._settings.steps_off * self._limits.step + self._limits.slack, MODEL_STEP)
-        reported = state.pan, state.tilt
+        settings, reported = self._settings, (state.pan, state.tilt)
         return all(
-            abs(q - x) <= coarse + self._settings.time_off_s * abs(v)
-            for q, (x, v) in zip(reported, motion, strict=True)
+            abs(q - x) <= max(settings.steps_off * axis.step + axis.slack, MODEL_STEP) + settings.time_off_s * abs(v)
+            for q, (x, v), axis in zip(reported, motion, self._limits.axes, strict=True)
         )
 
     def _begin_anew(self, state: PanTiltState) -> None:
@@ -150,12 +149,13 @@ class HeadModel:
 
     def _speeds(self, state: PanTiltState) -> Angles:
         """Speeds of both axes from the last two reports [rad/s]; 0 at rest, and after the first report."""
-        last, fastest = self._last, self._limits.speed
+        last = self._last
         if last is None or not state.moving or state.t <= last.t:
             return 0.0, 0.0
+        ways = (state.pan - last.pan, state.tilt - last.tilt)
         pan, tilt = (
-            min(max((b - a) / (state.t - last.t), -fastest), fastest)
-            for a, b in ((last.pan, state.pan), (last.tilt, state.tilt))
+            min(max(way / (state.t - last.t), -axis.speed), axis.speed)
+            for way, axis in zip(ways, self._limits.axes, strict=True)
         )
         return pan, tilt
 
@@ -167,8 +167,8 @@ class HeadModel:
             return pan, tilt
         goals, speeds = (command.pan, command.tilt), limits.capped(command.speed)
         a, b = (
-            axis_at(seconds, x, v, goal, speed, limits.acceleration)
-            for (x, v), goal, speed in zip((pan, tilt), goals, speeds, strict=True)
+            axis_at(seconds, x, v, goal, speed, axis.assumed_acceleration)
+            for (x, v), goal, speed, axis in zip((pan, tilt), goals, speeds, limits.axes, strict=True)
         )
         return a, b
 
@@ -182,10 +182,14 @@ def axis_at(seconds: float, x: float, v: float, goal: float, speed: float, accel
         v: start speed [rad/s].
         goal: position of rest [rad].
         speed: highest speed [rad/s]; if infinite, the axis jumps.
-        acceleration: acceleration and deceleration [rad/s^2]; if infinite, the axis jumps.
+        acceleration: acceleration and deceleration [rad/s^2]; if infinite, the axis is at once at full speed.
     """
-    if math.isinf(speed) or math.isinf(acceleration):
+    if math.isinf(speed):
         return (goal if seconds >= 0 else x), 0.0
+    if math.isinf(acceleration):
+        way = min(speed * max(seconds, 0.0), abs(goal - x))
+        turns = math.copysign(1.0, goal - x)
+        return (x + turns * way, turns * speed) if way < abs(goal - x) else (goal, 0.0)
     stop = x + v * abs(v) / (2 * acceleration)
     side = math.copysign(1.0, goal - stop)
     phases: list[tuple[float, float]] = []  # duration and acceleration
@@ -273,7 +277,7 @@ class HeadController:
         Returns:
             The command; None if the head is best left alone.
         """
-        zone = max(self._settings.zone * field, self._limits.step)
+        zone = max(self._settings.zone * field, *(axis.step for axis in self._limits.axes))
         reference = self._damped(wanted, rates, zone, lead_s)
         resting = (
             self._axes_at_rest(effect_t, interval_s, reference, zone) if self._settings.deadband else [False, False]
@@ -281,7 +285,7 @@ class HeadController:
         if self._settings.deadband and self._may_hold(effect_t, interval_s, reference, zone, resting):
             return None
         off = _angle_between(reference.wanted, self._at(effect_t), wanted[1])
-        if math.isinf(self._limits.acceleration):  # it jumps: halfway to the next command
+        if math.isinf(min(axis.speed for axis in self._limits.axes)):  # it jumps: halfway to the next command
             command = HeadCommand(*reference.after(interval_s / 2), None)
         elif reference.still and off > zone:
             command = HeadCommand(*reference.wanted, None)
@@ -315,9 +319,11 @@ class HeadController:
         off_then = _angle_between(reference.after(interval_s), self._at(effect_t + interval_s), reference.wanted[1])
         # At rest in place, or on the way there; an axis that overran its goal while following would return too slowly.
         if reference.still and off_goal <= zone and (command.speed is None or off_then <= zone):
-            fine = max(self._settings.fine_steps * self._limits.step, self._settings.fine * zone)
-            there = zip(reference.after(interval_s), self._at(effect_t + interval_s), strict=True)
-            centred = all(abs(q - to_step(x, self._limits.step)) <= fine for q, x in there)
+            there = zip(reference.after(interval_s), self._at(effect_t + interval_s), self._limits.axes, strict=True)
+            centred = all(
+                abs(q - to_step(x, axis.step)) <= max(self._settings.fine_steps * axis.step, self._settings.fine * zone)
+                for q, x, axis in there
+            )
             return centred or effect_t - self.head.commanded_t < self._settings.rest_s
         return all(resting)
 
@@ -347,15 +353,15 @@ class HeadController:
         self, effect_t: float, interval_s: float, reference: _Reference, catch_s: float
     ) -> HeadCommand:
         """Set a goal ahead of each axis, and the target's speed, corrected for the axis's error."""
-        limits = self._limits
         ahead = max(self._settings.ahead_s, self._settings.frames_ahead * interval_s)
         goals, speeds = [], []
-        for w, r, x in zip(reference.wanted, reference.rates, self._at(effect_t), strict=True):
+        there = zip(reference.wanted, reference.rates, self._at(effect_t), self._limits.axes, strict=True)
+        for w, r, x, axis in there:
             v = r + (w - x) / catch_s
-            v = math.copysign(min(abs(v), limits.speed), v)
+            v = math.copysign(min(abs(v), axis.speed), v)
             # Behind the target, an axis goes to where it will be; ahead of it, an axis slows down until it catches up.
             start, rate = (w, r) if v * (w - x) > 0 else (x, v)
-            goals.append(start + rate * ahead + rate * abs(rate) / (2 * limits.acceleration))  # and brakes
+            goals.append(start + rate * ahead + rate * abs(rate) / (2 * axis.assumed_acceleration))  # and brakes
             speeds.append(max(abs(v), LEAST_SPEED))
         return HeadCommand(goals[0], goals[1], (speeds[0], speeds[1]))
 
@@ -385,8 +391,8 @@ class HeadController:
     def _clipped(self, command: HeadCommand) -> HeadCommand:
         """Clip a command to the limits of pan and tilt."""
         pan, tilt = (
-            min(max(q, low), high)
-            for q, (low, high) in ((command.pan, self._limits.pan), (command.tilt, self._limits.tilt))
+            min(max(q, axis.range[0]), axis.range[1])
+            for q, axis in zip((command.pan, command.tilt), self._limits.axes, strict=True)
         )
         return HeadCommand(pan, tilt, command.speed)
 

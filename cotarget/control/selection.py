@@ -143,12 +143,7 @@ def _worth(order: Plan) -> tuple[int, float, int]:
 
 def travel_s(way: Angles, limits: PanTiltLimits) -> float:
     """Travel time of the head from rest to rest, over an angle of pan and tilt [rad] with both axes at once [s]."""
-    longest = max(abs(way[0]), abs(way[1]))
-    if math.isinf(limits.acceleration):  # full speed at once, or a jump
-        return longest / limits.speed
-    if longest * limits.acceleration <= limits.speed**2:  # it does not reach full speed
-        return 2 * math.sqrt(longest / limits.acceleration)
-    return longest / limits.speed + limits.speed / limits.acceleration
+    return max(axis.travel_s(each) for each, axis in zip(way, limits.axes, strict=True))
 
 
 def done_in(candidate: Candidate, state: SelectionState, head: Angles, now: float) -> float:

@@ -100,7 +100,7 @@ class SharedState:
 
     frames: FrameBuffer  # of the viewfinder; its lock is apart from ``changed``
     changed: threading.Condition = field(default_factory=threading.Condition)
-    wanted: int = 0  # commanded lens position
+    wanted: float = 0  # commanded lens position
     order: int = 0  # sequence number of the lens command
     standing: bool = True  # whether the lens has reached the last command
     motion: LensMotion | None = None  # estimated; None before the camera is open
@@ -142,7 +142,7 @@ class ZoomSetting:
 
     name: str
     lens: LensPositions
-    values: Mapping[int, str | float]
+    values: Mapping[float, str | float]
 
 
 def patiently(clock: Clock, call: Callable[[], T]) -> T:
@@ -234,7 +234,7 @@ def _zoom_setting(
     return ZoomSetting(name, LensPositions(config.lens, inside, config.pitch_mm), values)
 
 
-def _positions(setting: Setting) -> dict[int, str | float]:
+def _positions(setting: Setting) -> dict[float, str | float]:
     """List a setting's lens positions and the value that selects each; empty if the setting moves no lens."""
     if setting.kind == "range":
         step = setting.step if setting.step > 0 else 1.0
@@ -335,7 +335,7 @@ class LensJob:
             else:
                 self._due = due
 
-    def _send(self, zoom: ZoomSetting, wanted: int) -> None:
+    def _send(self, zoom: ZoomSetting, wanted: float) -> None:
         start = self._clock.now() + self._config.command_delay_s
         self._link.put(zoom.name, zoom.values[wanted])
         with self._shared.changed:
@@ -345,7 +345,7 @@ class LensJob:
         self._due = now = self._clock.now()
         self._deadline = max(motion.arrives, now) + VERIFY_S
 
-    def _verify(self, zoom: ZoomSetting, wanted: int) -> None:
+    def _verify(self, zoom: ZoomSetting, wanted: float) -> None:
         reading = _number(self._link.get(zoom.name).value)
         if reading == wanted:
             with self._shared.changed:
@@ -358,7 +358,7 @@ class LensJob:
             shown = "nothing" if reading is None else f"{reading:g}"
             self._give_up(wanted, f"its setting '{zoom.name}' reads {shown}")
 
-    def _give_up(self, wanted: int, why: str) -> None:
+    def _give_up(self, wanted: float, why: str) -> None:
         with self._shared.changed:
             if self._shared.order == self._order:  # the failure does not concern a newer command
                 self._shared.lens_trouble = f"the zoom camera's lens did not go to position {wanted}: {why}"

@@ -13,6 +13,7 @@ at another port. Another in the user's state folder applies to the unit at its p
 import contextlib
 import errno
 import hashlib
+import ipaddress
 import logging
 import re
 import socket
@@ -115,6 +116,36 @@ def _reason(file: Path) -> str:
     except OSError:
         said = ""
     return "".join(c if c.isprintable() else " " for c in said.strip())[:LONGEST_REASON] or NO_REASON
+
+
+ADDRESS_KEYS = ("port", "host", "url", "address")  # of settings that say where a device is
+
+
+def addresses_of(settings: object) -> tuple[str, ...]:
+    """Return the addresses in a device's settings: a serial port, HOST, HOST:PORT or a URL; the first is its own.
+
+    They are what the keys `port`, `host`, `url` and `address` hold, and what is an address by its form: an IP address,
+    a path in /dev, or a URL. A number in `port` is the port of that host. Settings may say it by a property `address`.
+    """
+    number = getattr(settings, "port", "")
+    port = str(number) if str(number).isdigit() and int(number) else ""
+    found = [] if "address" in vars(settings) else [str(getattr(settings, "address", ""))]
+    for key, value in vars(settings).items():
+        if not isinstance(value, str) or not value or (key == "port" and value.isdigit()):
+            continue
+        if (is_ip := _is_ip(value)) or key in ADDRESS_KEYS or "://" in value or value.startswith("/dev/"):
+            is_host = "://" not in value and "/" not in value and key != "port"
+            host = f"[{value}]" if is_ip and ":" in value else value  # version 6
+            found.append(f"{host}:{port}" if is_host and port else host)
+    return tuple(dict.fromkeys(filter(None, found)))
+
+
+def _is_ip(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
 
 
 # Ports that a URL may leave out.

@@ -1,5 +1,6 @@
 """Zoom lenses that are driven by position: focal length of a position, and estimated position during a motion."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,19 +13,19 @@ class LensPositions:
     Attributes:
         knots: (position, focal length [mm]), both increasing; the logarithm of the focal length is interpolated.
         positions: positions to which the lens can be sent, increasing and within the knots.
-        pitch_mm: size of a pixel of the stream [mm].
+        pitch_mm: size of a pixel of the stream [mm]; 1 for focal lengths of knots in pixels.
     """
 
-    knots: tuple[tuple[int, float], ...]
-    positions: tuple[int, ...]
-    pitch_mm: float
+    knots: tuple[tuple[float, float], ...]
+    positions: Sequence[float]
+    pitch_mm: float = 1.0
 
     def focal_at(self, position: float) -> float:
         """Return the nominal focal length [px] at a position; beyond the knots that of the nearest one."""
         at, mm = zip(*self.knots, strict=True)
         return float(np.exp(np.interp(position, at, np.log(mm)))) / self.pitch_mm
 
-    def position_for(self, focal_px: float) -> int:
+    def position_for(self, focal_px: float) -> float:
         """Return the position [1] nearest to a nominal focal length [px], of those that the lens can be sent to."""
         at, mm = zip(*self.knots, strict=True)
         exact = np.interp(np.log(focal_px * self.pitch_mm), np.log(mm), at)

@@ -1,10 +1,10 @@
 """A pan-tilt unit that is polled on a thread of its own, behind the Rig's `PanTilt` Protocol.
 
-`PolledHead` is the head that the pipeline sees; a driver gives it a `HeadLink`, which speaks the unit's protocol. A
-thread runs `Loop`, the only user of the link: it polls both axes all the time and sends the commands of other threads.
-One turn of the loop is one exchange with the unit, or the few exchanges of one move. Other threads only append requests
-to queues and read the newest `HeadSnapshot`, without locks, so that a signal handler may halt the head whatever code it
-interrupted.
+`PolledHead` is the head that the pipeline sees; a driver gives it a `HeadLink`, which speaks the unit's protocol. The
+zoom lens may be a third axis of the unit, `PolledLens`. A thread runs `Loop`, the only user of the link: it polls the
+axes all the time and sends the commands of other threads. One turn of the loop is one exchange with the unit, or the
+few exchanges of one move. Other threads only append to `Requests` and read the newest `Snapshot`, without locks, so
+that a signal handler may halt the head whatever code it interrupted.
 """
 
 import atexit
@@ -12,233 +12,29 @@ import contextlib
 import itertools
 import logging
 import math
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass, field
-from typing import Annotated, NamedTuple, Protocol, TypeVar
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Annotated, Protocol, TypeVar
 
 from cotarget.config import SafetyConfig
-from cotarget.drivers.interlock import PositionLostMarker
+from cotarget.drivers.axes import AxisFacts, AxisTrack, Poll
+from cotarget.drivers.interlock import PositionLostMarker, addresses_of
+from cotarget.drivers.lens import LensPositions
 from cotarget.drivers.link_errors import CutError, LostError, PositionLostError, RefusedError, SilentError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from cotarget.plugins import place_of
-from cotarget.rig import Clock, HeadSpec, PanTiltLimits, PanTiltState, Speed
-from cotarget.schema import Limits, Needed, NotNegative, OneOf, Positive, model
+from cotarget.rig import AxisLimits, Clock, HeadSpec, PanTiltLimits, PanTiltState, Speed, ZoomState
+from cotarget.schema import Limits, NotNegative, OneOf, Positive, model
 
 log = logging.getLogger(__name__)
-
-# What a driver provides
-
-
-@dataclass(frozen=True)
-class AxisFacts:
-    """What a unit reports about one of its axes.
-
-    Attributes:
-        step: size of a step [rad].
-        lowest: position [steps].
-        highest: position [steps].
-        slowest: speed [steps/s].
-        fastest: speed [steps/s].
-        acceleration: [steps/s^2].
-        still_s: an axis stands when it has stayed at one step, or within its slack, for this time [s]; longer than the
-            slowest speed takes for a step.
-        slack: an axis that stands this far from its goal has arrived; 0 for a stepper, the control error of a servo
-            [steps].
-        loses_steps: whether the unit counts from a wrong position after the axis was blocked, as a stepper without an
-            encoder does. An axis that does not is asked where it is, and never has a lost position.
-    """
-
-    step: float
-    lowest: int
-    highest: int
-    slowest: int
-    fastest: int
-    acceleration: int
-    still_s: float
-    slack: int = 0
-    loses_steps: bool = True
-
-    def degrees(self, sign: int) -> tuple[float, float]:
-        """Convert the limits to degrees with rig.toml's sign of the axis: lowest, highest."""
-        a, b = (sign * end * math.degrees(self.step) for end in (self.lowest, self.highest))
-        return min(a, b), max(a, b)
-
-
-def braking_s(axes: tuple[AxisFacts, AxisFacts]) -> float:
-    """Return the longest time to stop an axis from its highest speed [s]."""
-    return max(axis.fastest / axis.acceleration for axis in axes)
-
-
-class Poll(NamedTuple):
-    """Position [steps] of an axis, 0 for pan and 1 for tilt, and the time at which the unit read it [s]."""
-
-    axis: int
-    position: int
-    t: float
-
-
-class HeadLink(Protocol):
-    """The protocol of an opened pan-tilt unit; `PolledHead` makes one call at a time.
-
-    A link is a subclass, and so has the methods with a default. It repeats what may be repeated, and ends each call in
-    a bounded time. Besides the errors named below every method but `close` may raise LostError where the port failed,
-    SilentError where the unit does not answer any more, PositionLostError where its position may be lost, or another
-    DeviceError where it cannot be used; the head is then halted and closed for good.
-
-    Attributes:
-        name: of the port, for messages.
-        axes: facts of pan and tilt, as the unit reported them when it was opened.
-        hurry: set by `PolledHead`; returns whether a halt waits, so that a link that waits for an answer may give up.
-    """
-
-    name: str
-    axes: tuple[AxisFacts, AxisFacts]
-    hurry: Callable[[], bool] = staticmethod(lambda: False)
-
-    def poll(self) -> Sequence[Poll]:
-        """Ask for the position of one axis, in turn, or of both.
-
-        Raises:
-            CutError: the unit was halted because it was silent.
-        """
-
-    def move(self, goals: tuple[int, int], speeds: tuple[int, int], proceed: Callable[[], None]) -> None:
-        """Send pan and tilt to positions [steps] at speeds [steps/s]; return when the unit has taken the command.
-
-        Args:
-            goals: within the limits of `axes`.
-            speeds: within the limits of `axes`.
-            proceed: to be called before each message, also a repeated one; raises where a more urgent request waits,
-                and the rest must not be sent.
-
-        Raises:
-            RefusedError: the unit refused the command.
-            CutError: the unit was halted because it was silent.
-        """
-
-    def halt(self, patience: float) -> None:
-        """Stop both axes; return when the unit has acknowledged it, which takes ``patience`` [s] at most.
-
-        An axis that stands keeps its goal: a servo whose goal becomes its present position would move a little at each
-        halt.
-        """
-
-    def halt_last(self, patience: float) -> None:
-        """Stop both axes in whatever state unit and line are; no other command follows. By default as `halt` does."""
-        self.halt(patience)
-
-    def send_halt(self) -> None:
-        """Send the halt and wait for no answer; by default as `halt` does."""
-        self.halt(0.0)
-
-    def goals(self) -> tuple[int, int] | None:
-        """Positions [steps] that the unit was last sent to, also by another program; None if it cannot tell."""
-        return None
-
-    def check(self) -> None:
-        """Raise PositionLostError if the unit has reported by itself that its position may be lost; by default not."""
-
-    def close(self) -> None:
-        """Release the port; never raises."""
-
-
-StepSize = Positive | Annotated[tuple[Positive, Positive], "[pan, tilt]"]
-
-
-@model
-class PolledHeadSettings:
-    """The settings in [hardware.head] that every polled head has.
-
-    Attributes:
-        port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
-        step_deg: step size that the unit is expected to report, or those of pan and tilt [degrees].
-        pan_deg: range of pan that the unit is expected to report, with positive pan to the right [degrees].
-        tilt_deg: range of tilt that the unit is expected to report, with positive tilt up [degrees].
-        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left.
-        tilt_sign: 1 where the unit's positive tilt goes up, -1 where it goes down.
-        speed_deg_s: speed of moves, at most the unit's own [degrees/s].
-        command_delay_s: time from a command to the start of motion, as measured [s].
-    """
-
-    _: KW_ONLY
-    port: Annotated[str, Needed("/dev/ttyUSB0")] = ""
-    step_deg: StepSize
-    pan_deg: Limits
-    tilt_deg: Limits
-    pan_sign: Annotated[int, OneOf(-1, 1)] = 1
-    tilt_sign: Annotated[int, OneOf(-1, 1)] = 1
-    speed_deg_s: Positive
-    command_delay_s: NotNegative = 0.04
-
-    @property
-    def steps_deg(self) -> tuple[float, float]:
-        """Step sizes of pan and tilt [degrees]."""
-        return self.step_deg if isinstance(self.step_deg, tuple) else (self.step_deg, self.step_deg)
-
-    @property
-    def spec(self) -> HeadSpec:
-        """Describe the head by its coarser step; its acceleration is not known before it is opened."""
-        speed, step = math.radians(self.speed_deg_s), math.radians(max(self.steps_deg))
-        limits = PanTiltLimits(_radians(self.pan_deg), _radians(self.tilt_deg), speed, math.inf, step)
-        return HeadSpec(limits, self.command_delay_s)
-
-
-# Axis positions from polls
-
-
-@dataclass(frozen=True)
-class HeadSnapshot:
-    """Positions of both axes at one time, interpolated between polls."""
-
-    pan: float  # [steps]
-    tilt: float  # [steps]
-    moving: bool  # whether a move is under way or an axis has not stood for long enough
-    t: float  # time of the positions [s]
-
-
-class AxisTrack:
-    """Position and rest of one axis, from its polls."""
-
-    def __init__(self, facts: AxisFacts) -> None:
-        self.facts = facts
-        self.polls: deque[tuple[float, int]] = deque(maxlen=2)
-        self._valid = -float("inf")
-        self._since: float | None = None
-        self._rest = 0  # position at that time [steps]
-
-    @property
-    def position(self) -> int:
-        """Position of the newest poll [steps]."""
-        return self.polls[-1][1]
-
-    def add(self, t: float, position: int) -> None:
-        """Add a poll: the position [steps] at ``t`` [s]."""
-        if t < self._valid:
-            self._since = None
-        elif self._since is None or abs(position - self._rest) > self.facts.slack:
-            self._since, self._rest = t, position
-        self.polls.append((t, position))
-
-    def expect_motion(self, t: float) -> None:
-        """Count the axis as moving, until polls after ``t`` [s] show that it stands."""
-        self._valid, self._since = t, None
-
-    def stands(self) -> bool:
-        """Return whether the axis has stayed in place for as long as its facts ask for."""
-        return self._since is not None and self.polls[-1][0] - self._since >= self.facts.still_s
-
-    def at(self, t: float) -> float:
-        """Interpolate the position [steps] at a time [s] between the last two polls."""
-        (t0, x0), (t1, x1) = self.polls[0], self.polls[-1]
-        share = (t - t0) / (t1 - t0) if t1 > t0 else 1.0
-        return x0 + (x1 - x0) * min(max(share, 0.0), 1.0)
-
 
 # Requests of other threads
 
 Request = TypeVar("Request")
+Pair = tuple[float, float]  # of pan and tilt, in the unit's numbers
 
 
 class DroppedError(HaltedError):
@@ -250,8 +46,8 @@ class Move:
     """A request to move both axes."""
 
     number: int  # sequence number of the request; a move numbered before a halt is not sent any more
-    goals: tuple[int, int]  # of pan and tilt [steps]
-    speeds: tuple[int, int]  # of pan and tilt [steps/s]
+    goals: Pair
+    speeds: Pair
     wait: bool = False  # whether the caller waits for the end, and so receives the error
     deadline: float | None = None  # time by which the head should have arrived [s]; None until the move is sent
     cuts: int = 0  # how often the move was sent again after the line was silent
@@ -273,9 +69,185 @@ class Halt:
     done: threading.Event = field(default_factory=threading.Event)  # set when it has, or will not
 
 
-def drained(queue: deque[Request]) -> list[Request]:
+class Requests:
+    """What other threads want of the unit: the newest move wins, and a halt comes before it.
+
+    Attributes:
+        halts: halts that were not sent yet.
+        moves: moves that were not sent yet; the newest wins.
+        zooms: positions of the lens that were not sent yet; the newest wins.
+        closing: whether no more requests will come.
+    """
+
+    def __init__(self) -> None:
+        self.halts: deque[Halt] = deque()
+        self.moves: deque[Move] = deque()
+        self.zooms: deque[float] = deque()
+        self.closing = False
+        self._woken: queue.SimpleQueue[None] = queue.SimpleQueue()  # whose `put` a signal handler may call
+
+    def add(self, queued: deque[Request], request: Request) -> None:
+        """Append a request to one of the queues; end a `pause`."""
+        queued.append(request)
+        self._woken.put(None)
+
+    def close(self) -> None:
+        """Let the loop end; no more requests will come."""
+        self.closing = True
+        self._woken.put(None)
+
+    def pause(self, seconds: float) -> None:
+        """Wait until a request comes, for at most a time [s]."""
+        with contextlib.suppress(queue.Empty):
+            self._woken.get(timeout=seconds)
+
+    def halt_waits(self) -> bool:
+        """Whether a halt, or the end of the driver, waits: a link gives up waiting for the unit."""
+        return self.closing or bool(self.halts)
+
+    def proceed(self) -> None:
+        """Raise if something more urgent than the command under way waits, and the rest of it must not be sent.
+
+        Raises:
+            DroppedError: a halt or a newer move waits.
+        """
+        if self.halt_waits():
+            raise DroppedError("the move was halted")
+        if self.moves:
+            raise DroppedError("another move took this one's place")
+
+
+def drained(queued: deque[Request]) -> list[Request]:
     """Take all requests out of a queue that other threads go on filling."""
-    return [queue.popleft() for _ in range(len(queue))]
+    return [queued.popleft() for _ in range(len(queued))]
+
+
+# What a driver provides
+
+
+class HeadLink(Protocol):
+    """The protocol of an opened pan-tilt unit; `PolledHead` makes one call at a time.
+
+    A link is a subclass, and so has the methods with a default. It repeats what may be repeated, and ends each call in
+    a bounded time. Besides the errors named below every method but `close` may raise LostError where the port failed,
+    SilentError where the unit does not answer any more, PositionLostError where its position may be lost, or another
+    DeviceError where it cannot be used; the head is then halted and closed for good.
+
+    Attributes:
+        name: of the port, for messages.
+        axes: facts of pan, of tilt, and of the lens where the unit moves it too, as reported when it was opened.
+        pause_s: pause between polls [s]; 0 where the exchange itself takes the time, as on a serial line.
+    """
+
+    name: str
+    axes: tuple[AxisFacts, ...]
+    pause_s: float = 0.0
+
+    def poll(self, requests: Requests) -> Sequence[Poll]:
+        """Ask for the position of one axis, in turn, or of several.
+
+        Args:
+            requests: where a halt waits, an answer that takes long is not waited for; then nothing is returned.
+
+        Raises:
+            CutError: the unit was halted because it was silent.
+        """
+
+    def move(self, goals: Pair, speeds: Pair, requests: Requests) -> None:
+        """Send pan and tilt to positions at speeds; return when the unit has taken the command.
+
+        Args:
+            goals: within the limits of `axes`, in their numbers, and whole steps.
+            speeds: within the limits of `axes`, in their numbers.
+            requests: its `proceed` is called before each message but the first, also before a repeated one.
+
+        Raises:
+            RefusedError: the unit refused the command.
+            CutError: the unit was halted because it was silent.
+        """
+
+    def renew(self, requests: Requests) -> None:
+        """Go on with the move under way; called after each poll until the head has arrived. By default does nothing.
+
+        For a unit that takes velocities: `move` keeps the goals, and `renew` sends the velocities that lead there.
+        Raises as `move` does.
+        """
+        return
+
+    def zoom(self, position: float, requests: Requests) -> None:
+        """Send the lens to a position, if it is one of the `axes`. Arguments and errors are those of `move`."""
+        raise DeviceError(f"the unit at {self.name} moves no lens")
+
+    def halt(self, patience: float) -> None:
+        """Stop pan and tilt; return when the unit has acknowledged it, which takes ``patience`` [s] at most.
+
+        An axis that stands keeps its goal: a servo whose goal becomes its present position would move a little at each
+        halt.
+        """
+
+    def halt_last(self, patience: float) -> None:
+        """Stop both axes in whatever state unit and line are; no other command follows. By default as `halt` does."""
+        self.halt(patience)
+
+    def send_halt(self) -> None:
+        """Send the halt and wait for no answer; by default as `halt` does."""
+        self.halt(0.0)
+
+    def goals(self) -> Pair | None:
+        """Positions that pan and tilt were last sent to, also by another program; None if the unit cannot tell."""
+        return None
+
+    def check(self) -> None:
+        """Raise PositionLostError if the unit has reported by itself that its position may be lost; by default not."""
+
+    def close(self) -> None:
+        """Release the port; never raises."""
+
+
+@model
+class PolledHeadSettings:
+    """The settings in rig.toml that every polled head has.
+
+    Attributes:
+        step_deg: step size that the unit is expected to report, or those of pan and tilt; 0 for a continuous axis
+            [degrees].
+        pan_deg: range of pan that the unit is expected to report, with positive pan to the right [degrees].
+        tilt_deg: range of tilt that the unit is expected to report, with positive tilt up [degrees].
+        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left.
+        tilt_sign: 1 where the unit's positive tilt goes up, -1 where it goes down.
+        speed_deg_s: speed of moves, at most the unit's own [degrees/s].
+        command_delay_s: time from a command to the start of motion, as measured [s].
+    """
+
+    _: KW_ONLY
+    step_deg: NotNegative | Annotated[tuple[NotNegative, NotNegative], "[pan, tilt]"]
+    pan_deg: Limits
+    tilt_deg: Limits
+    pan_sign: Annotated[int, OneOf(-1, 1)] = 1
+    tilt_sign: Annotated[int, OneOf(-1, 1)] = 1
+    speed_deg_s: Positive
+    command_delay_s: NotNegative = 0.04
+
+    @property
+    def steps_deg(self) -> tuple[float, float]:
+        """Step sizes of pan and tilt [degrees]."""
+        return self.step_deg if isinstance(self.step_deg, tuple) else (self.step_deg, self.step_deg)
+
+    @property
+    def signs(self) -> tuple[int, int]:
+        """Signs of pan and tilt."""
+        return self.pan_sign, self.tilt_sign
+
+    @property
+    def spec(self) -> HeadSpec:
+        """Describe the head; its acceleration is not known before it is opened."""
+        pan, tilt = (
+            AxisLimits(
+                (math.radians(low), math.radians(high)), math.radians(self.speed_deg_s), step=math.radians(step_deg)
+            )
+            for (low, high), step_deg in zip((self.pan_deg, self.tilt_deg), self.steps_deg, strict=True)
+        )
+        return HeadSpec(PanTiltLimits(pan, tilt), self.command_delay_s)
 
 
 # The thread that owns the link
@@ -283,6 +255,11 @@ def drained(queue: deque[Request]) -> list[Request]:
 TRIES = 3  # of a move, and of polls in a row, that end because the unit was silent
 PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
 LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: a unit may answer only when it stands [s]
+
+
+def braking_s(axes: Sequence[AxisFacts]) -> float:
+    """Return the longest time to stop pan or tilt from its highest speed [s]."""
+    return max(axis.braking_s(axis.fastest) for axis in axes[:2])
 
 
 def try_last_halt(link: HeadLink, reason: BaseException) -> bool:
@@ -302,6 +279,23 @@ def try_last_halt(link: HeadLink, reason: BaseException) -> bool:
     return True
 
 
+@dataclass(frozen=True)
+class Snapshot:
+    """Positions of axes at one time, interpolated between polls, in the unit's numbers.
+
+    Attributes:
+        positions: of pan and tilt, or of the lens.
+        moving: whether a command is under way or an axis is not known to stand.
+        t: time of the positions [s].
+        sigma: standard deviation of either angle [rad].
+    """
+
+    positions: tuple[float, ...]
+    moving: bool
+    t: float
+    sigma: float = 0.0
+
+
 class Loop:
     """Poll the unit and send requests; the only user of the link.
 
@@ -313,82 +307,84 @@ class Loop:
 
     def __init__(self, link: HeadLink, clock: Clock, delay: float) -> None:
         self._link, self._clock, self._delay = link, clock, delay
-        pan, tilt = (AxisTrack(facts) for facts in link.axes)
-        self._tracks = (pan, tilt)
-        self._polled = True  # since the last move: moves in quick succession must not displace the polls
+        self._tracks = tuple(AxisTrack(facts) for facts in link.axes)
+        self._head, self._lens = self._tracks[:2], self._tracks[2:]
+        self._polled = True  # since the last command: commands in quick succession must not displace the polls
         self._cuts = 0  # in a row, without a poll between them
         self._active: Move | None = None
-        self.moves: deque[Move] = deque()  # the newest wins
-        self.halts: deque[Halt] = deque()  # they come before moves
+        self.requests = Requests()
         self.halted = 0  # number of the newest halt that was taken out of the queue
-        self.closing = False  # set when no more requests will come
         self.rests = False  # whether the unit acknowledged the last halt, after which nothing more is sent
         self.errors: deque[DeviceError] = deque(maxlen=1)  # of a move without a waiting caller; the next call raises it
         while not all(track.polls for track in self._tracks):
-            self._poll_position()
-        self.snapshot = self._make_snapshot()
-        link.hurry = lambda: self.closing or bool(self.halts)
+            self._poll_axes()
+        self.snapshot, self.lens_snapshot = self._see(self._head), self._see(self._lens)
 
     def turn(self) -> None:
-        """Do the most urgent exchange: a halt, then a move, then a poll.
+        """Do the most urgent exchange: a halt, then a move, then a zoom, then a poll.
 
         Raises:
             PositionLostError: the head's position may be lost.
             DeviceError: the head cannot be used any more.
         """
+        requests = self.requests
         try:
-            if self.halts:
+            if requests.halts:
                 self._halt()
-            elif self.moves and self._polled:
+            elif requests.moves and self._polled:
                 self._move()
+            elif requests.zooms and self._polled:
+                self._zoom()
             else:
                 self._poll()
         except DroppedError as dropped:
             self._abandon(dropped)
         except CutError as cut:
             self._cuts += 1
-            self._expect_motion()
+            self._expect_motion(self._head)
             if self._active is not None:
                 self._requeue(self._active, cut)
             elif self._cuts >= TRIES:
                 raise
         self._link.check()
+        if self._polled and self._link.pause_s:
+            requests.pause(self._link.pause_s)
 
     def stop_for_good(self, reason: DeviceError) -> None:
         """Halt the head a last time, and end all requests with an error."""
-        self.closing = True
+        self.requests.closing = True
         self.rests = try_last_halt(self._link, reason)
-        for move in [*([self._active] if self._active else []), *drained(self.moves)]:
+        for move in [*([self._active] if self._active else []), *drained(self.requests.moves)]:
             move.finish(reason)
-        for halt in drained(self.halts):
+        for halt in drained(self.requests.halts):
             halt.done.set()
 
     def _halt(self) -> None:
-        requests = drained(self.halts)
+        halts = drained(self.requests.halts)
         # Threads that halt at the same time may queue their requests out of order.
-        self.halted = max([self.halted, *(request.number for request in requests)])
+        self.halted = max([self.halted, *(halt.number for halt in halts)])
         try:
             self._abandon(DroppedError("the move was halted"))
             self._stop()
-            for request in requests:
-                request.answered = True
+            for halt in halts:
+                halt.answered = True
         finally:
-            for request in requests:
-                request.done.set()
+            for halt in halts:
+                halt.done.set()
 
     def _stop(self) -> None:
         """Send the halt and wait for its answer."""
         self._link.halt(LOOP_HALT_S + braking_s(self._link.axes))
-        self._expect_motion()
+        self._expect_motion(self._head)
 
     def _move(self) -> None:
         # The snapshot must say moving before the request leaves the queue: PolledHead.state reads both.
-        self.snapshot = HeadSnapshot(self.snapshot.pan, self.snapshot.tilt, True, self.snapshot.t)
-        requests = drained(self.moves)
-        fresh = [request for request in requests if request.number > self.halted]
-        for request in requests:
-            if request not in fresh:
-                request.finish(DroppedError("the move was halted"))
+        self.snapshot = replace(self.snapshot, moving=True)
+        moves = drained(self.requests.moves)
+        fresh = [move for move in moves if move.number > self.halted]
+        for move in moves:
+            if move not in fresh:
+                move.finish(DroppedError("the move was halted"))
         if not fresh:
             return
         *older, move = fresh
@@ -401,43 +397,58 @@ class Loop:
             self._give_up(move, error)
 
     def _send(self, move: Move) -> None:
-        self._link.move(move.goals, move.speeds, self._proceed)
-        self._expect_motion()
-        ways = zip(self._tracks, move.goals, move.speeds, strict=True)
+        self._link.check()
+        self.requests.proceed()
+        self._link.move(move.goals, move.speeds, self.requests)
+        self._expect_motion(self._head)
         longest = max(
-            abs(goal - axis.position) / speed + 2 * speed / axis.facts.acceleration for axis, goal, speed in ways
+            abs(goal - axis.newest.position) / speed + 2 * axis.facts.braking_s(speed)
+            for axis, goal, speed in zip(self._head, move.goals, move.speeds, strict=True)
         )
         move.deadline = self._clock.now() + longest + self._delay + PATIENCE_S
 
-    def _proceed(self) -> None:
-        """Raise if the move under way must not be sent any further."""
-        self._link.check()
-        if self.halts or self.closing:
-            raise DroppedError("the move was halted")
-        if self.moves:
-            raise DroppedError("another move took this one's place")
+    def _zoom(self) -> None:
+        self.lens_snapshot = replace(self.lens_snapshot, moving=True)  # before the request leaves the queue, as a move
+        *_, position = drained(self.requests.zooms)
+        self._polled = False
+        try:
+            self._link.zoom(position, self.requests)
+        except (DroppedError, CutError):
+            self.requests.zooms.appendleft(position)  # a newer one replaces it
+            raise
+        except RefusedError as error:
+            self.errors.append(error)
+        self._expect_motion(self._lens)
 
-    def _expect_motion(self) -> None:
-        for track in self._tracks:
+    def _expect_motion(self, tracks: Sequence[AxisTrack]) -> None:
+        for track in tracks:
             track.expect_motion(self._clock.now() + self._delay)
 
     def _poll(self) -> None:
-        self._poll_position()
+        self._poll_axes()
         self._polled = True
         move = self._active
         if move is not None and move.deadline is not None:
-            if self._stand() and not self._off_goal(move):
+            if self._stand(self._head) and not self._off_goal(move):
                 self._active = None
-                self.snapshot = self._make_snapshot()
+                self.snapshot = self._see(self._head)
                 move.finish()
             elif self._late(move, move.deadline):
                 self._refuse_stalled(move)
-        self.snapshot = self._make_snapshot()
+            else:
+                self._renew(move)
+        self.snapshot, self.lens_snapshot = self._see(self._head), self._see(self._lens)
 
-    def _poll_position(self) -> None:
-        for axis, position, t in self._link.poll():
-            self._tracks[axis].add(t, position)
+    def _poll_axes(self) -> None:
+        for poll in self._link.poll(self.requests):
+            self._tracks[poll.axis].add(poll)
         self._cuts = 0
+
+    def _renew(self, move: Move) -> None:
+        try:
+            self._link.renew(self.requests)
+        except RefusedError as error:
+            self._give_up(move, error)
 
     def _give_up(self, move: Move, error: DeviceError) -> None:
         """Halt a move that failed; its waiting caller, or the next call of the head, gets the error."""
@@ -461,21 +472,21 @@ class Loop:
             return
         move.cuts += 1
         move.deadline = None
-        self.moves.appendleft(move)  # a newer move in the queue replaces it, a halt drops it
+        self.requests.moves.appendleft(move)  # a newer move in the queue replaces it, a halt drops it
 
     def _off_goal(self, move: Move) -> list[AxisTrack]:
         """List the axes whose newest poll is farther off the move's goal than their slack."""
-        goals = zip(self._tracks, move.goals, strict=True)
-        return [track for track, goal in goals if abs(track.position - goal) > track.facts.slack]
+        goals = zip(self._head, move.goals, strict=True)
+        return [track for track, goal in goals if not track.facts.is_near(track.newest.position, goal)]
 
     def _late(self, move: Move, deadline: float) -> bool:
         """Return whether a poll after the deadline shows an axis off its goal; a late thread alone does not count."""
-        return min(track.polls[-1][0] for track in self._tracks) > deadline and bool(self._off_goal(move))
+        return min(track.newest.t for track in self._head) > deadline and bool(self._off_goal(move))
 
     def _refuse_stalled(self, move: Move) -> None:
         """End a move that did not arrive in time; raise where an axis may have lost its position."""
-        pan, tilt = (track.position for track in self._tracks)
-        wanted = ", ".join(map(str, move.goals))
+        pan, tilt = (f"{track.newest.position:g}" for track in self._head)
+        wanted = ", ".join(f"{goal:g}" for goal in move.goals)
         what = f"did not arrive in time: pan {pan}, tilt {tilt} steps, where {wanted} were commanded; it was halted"
         if any(track.facts.loses_steps for track in self._off_goal(move)):
             raise PositionLostError(
@@ -485,14 +496,16 @@ class Loop:
         why = "see that nothing is in its way; if it always ends as far off, give its axes more slack in the driver"
         self._give_up(move, DeviceError(f"the pan-tilt unit at {self._link.name} {what}; {why}"))
 
-    def _stand(self) -> bool:
-        return all(track.stands() for track in self._tracks)
+    @staticmethod
+    def _stand(tracks: Sequence[AxisTrack]) -> bool:
+        return all(track.stands() for track in tracks)
 
-    def _make_snapshot(self) -> HeadSnapshot:
-        """Make a snapshot of both axes at the older one of their newest polls."""
-        pan, tilt = self._tracks
-        t = min(pan.polls[-1][0], tilt.polls[-1][0])
-        return HeadSnapshot(pan.at(t), tilt.at(t), self._active is not None or not self._stand(), t)
+    def _see(self, tracks: Sequence[AxisTrack]) -> Snapshot:
+        """Make a snapshot of pan and tilt, or of the lens, at the older one of their newest polls."""
+        t = min((track.newest.t for track in tracks), default=-math.inf)
+        moving = not self._stand(tracks) or (tracks is self._head and self._active is not None)
+        sigma = max((track.newest.sigma * track.facts.unit for track in tracks), default=0.0)
+        return Snapshot(tuple(track.interpolate(t) for track in tracks), moving, t, sigma)
 
 
 # The head
@@ -505,7 +518,7 @@ NOTHING_SAID = SafetyConfig()
 # Limits differ by a few steps from unit to unit and from reset to reset; a larger difference is another unit's.
 LIMITS_DEG = 3.0
 STEP_SHARE = 2e-3  # tolerance relative to the step, which the unit and rig.toml round
-ROUNDING = 1e-9  # relative; keeps a speed of whole steps/s from being rounded down after its conversion from degrees
+ROUNDING = 1e-9  # relative; of a speed after its conversion from degrees
 
 
 class PolledHead:
@@ -517,7 +530,7 @@ class PolledHead:
 
     Args:
         open_link: opens the unit, halts it, and raises CotargetError where it cannot be used.
-        config: port, limits, step and signs that the unit must report.
+        config: address, limits, steps and signs that the unit must report.
         clock: the rig's clock.
         safety: speed cap, which the unit must be able to keep, and stop file, beside which the marker file lies.
 
@@ -533,9 +546,10 @@ class PolledHead:
         clock: Clock,
         safety: SafetyConfig = NOTHING_SAID,
     ) -> None:
-        self._lost = PositionLostMarker(config.port, safety.stop_file)
+        address = next(iter(addresses_of(config)), "")
+        self._lost = PositionLostMarker(address, safety.stop_file)
         self._lost.refuse()
-        self._signs = (config.pan_sign, config.tilt_sign)
+        self._signs = config.signs
         self._numbers = itertools.count(1)
         self._dead: DeviceError | None = None
         self._closed = False
@@ -545,11 +559,12 @@ class PolledHead:
             self._remember(error)
             raise
         try:
-            self.axes = self._link.axes
-            compare(config, self.axes)
-            _refuse_too_slow("hardware.head.speed_deg_s", config.speed_deg_s, self.axes, config.port)
-            _refuse_too_slow("safety.speed_deg_s", safety.speed_deg_s, self.axes, config.port)
-            self._limits = _limits(self.axes, config)
+            self.axes = pan, tilt = self._link.axes[:2]
+            compare(config, self.axes, address)
+            _refuse_too_slow("hardware.head.speed_deg_s", config.speed_deg_s, self.axes, address)
+            _refuse_too_slow("safety.speed_deg_s", safety.speed_deg_s, self.axes, address)
+            speed = math.radians(config.speed_deg_s)
+            self._limits = PanTiltLimits(pan.limits(config.pan_sign, speed), tilt.limits(config.tilt_sign, speed))
             self._goals = self._link.goals()
             self._loop = Loop(self._link, clock, config.command_delay_s)
             self._wait_until_it_stands(clock)
@@ -558,7 +573,7 @@ class PolledHead:
             self._remember(error)
             self._link.close()
             raise
-        self._thread = threading.Thread(target=self._run, name=f"head at {config.port}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"head at {address}", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # a program that ends without closing the head must not leave it turning
 
@@ -575,10 +590,17 @@ class PolledHead:
         """
         self._raise_pending()
         # In this order: the loop sets the snapshot to moving before it takes a request out of the queue.
-        waiting = bool(self._loop.moves)
+        waiting = bool(self._loop.requests.moves)
         seen = self._loop.snapshot
-        pan, tilt = self._angles(seen.pan, seen.tilt)
-        return PanTiltState(pan, tilt, seen.moving or waiting, seen.t)
+        return PanTiltState(*self._angles(seen.positions), seen.moving or waiting, seen.t, seen.sigma)
+
+    def lens(self, positions: LensPositions) -> "PolledLens":
+        """Return the lens of a unit that has it as a third axis.
+
+        Args:
+            positions: focal lengths of its positions.
+        """
+        return PolledLens(self._loop, positions, self._raise_pending)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """Command both axes; the newest command wins.
@@ -586,8 +608,8 @@ class PolledHead:
         Args:
             pan: angle [rad].
             tilt: angle [rad].
-            speed: of both axes or of each [rad/s]; by default, and at most, the configured one. The unit takes whole
-                steps/s, rounded down, and has a lowest speed.
+            speed: of both axes or of each [rad/s]; by default, and at most, the configured one. The unit may have a
+                lowest speed.
             wait: return only when the head stands at the goal.
 
         Returns:
@@ -601,28 +623,23 @@ class PolledHead:
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
         fastest = self._limits.capped(speed)
-        axes = self.axes
-        a, b = self._goals = self._kept(
-            [
-                min(max(round(sign * angle / axis.step), axis.lowest), axis.highest)
-                for sign, angle, axis in zip(self._signs, (pan, tilt), axes, strict=True)
-            ]
-        )
-        move = Move(number, (a, b), (_steps(fastest[0], axes[0]), _steps(fastest[1], axes[1])), wait)
-        self._loop.moves.append(move)
+        axes = tuple(zip(self.axes, self._signs, (pan, tilt), strict=True))
+        a, b = self._goals = self._kept([axis.goal(angle, sign) for axis, sign, angle in axes])
+        move = Move(number, (a, b), (self.axes[0].speed(fastest[0]), self.axes[1].speed(fastest[1])), wait)
+        self._loop.requests.add(self._loop.requests.moves, move)
         if wait:
             self._wait_for(move)
-        return self._angles(a, b)
+        return self._angles((a, b))
 
-    def _kept(self, goals: Sequence[int]) -> tuple[int, int]:
+    def _kept(self, goals: Sequence[float]) -> Pair:
         """Keep the last goal of an axis that is sent to where it stands, off that goal by its slack at most.
 
         A servo rests a little off each goal; sent to where it rests, it would move on by as much.
         """
         seen, kept = self._loop.snapshot, list(goals)
         for i, (goal, axis) in enumerate(zip(goals, self.axes, strict=True)):
-            stands_there = not seen.moving and goal == round((seen.pan, seen.tilt)[i])
-            if stands_there and self._goals is not None and abs(self._goals[i] - goal) <= axis.slack:
+            stands_there = not seen.moving and abs(goal - seen.positions[i]) <= axis.same
+            if stands_there and self._goals is not None and axis.is_near(self._goals[i], goal):
                 kept[i] = self._goals[i]
         return kept[0], kept[1]
 
@@ -638,7 +655,7 @@ class PolledHead:
         if self._closed:
             return
         request = Halt(next(self._numbers))
-        self._loop.halts.append(request)
+        self._loop.requests.add(self._loop.requests.halts, request)
         request.done.wait(HALT_S + braking_s(self.axes) if self._thread.is_alive() else 0.0)
         if request.answered or self._loop.rests:
             return
@@ -653,7 +670,8 @@ class PolledHead:
         """Halt, end the thread and release the port; never raises, and may be called again."""
         if self._closed:
             return
-        self._closed = self._loop.closing = True
+        self._closed = True
+        self._loop.requests.close()
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
             log.warning("%s: the thread of the pan-tilt unit does not end", self._link.name)
@@ -663,7 +681,7 @@ class PolledHead:
     def _run(self) -> None:
         reason: DeviceError = DroppedError(f"the pan-tilt unit at {self._link.name} is closed")
         try:
-            while not self._loop.closing:
+            while not self._loop.requests.closing:
                 self._loop.turn()
         except DeviceError as error:
             reason = error
@@ -679,9 +697,10 @@ class PolledHead:
         if isinstance(error, PositionLostError):
             self._lost.note(str(error))
 
-    def _angles(self, pan: float, tilt: float) -> tuple[float, float]:
-        """Convert steps of the unit to angles [rad]."""
-        return self._signs[0] * pan * self.axes[0].step, self._signs[1] * tilt * self.axes[1].step
+    def _angles(self, positions: Sequence[float]) -> Pair:
+        """Convert positions of pan and tilt to angles [rad]."""
+        pan, tilt = (sign * at * axis.unit for sign, at, axis in zip(self._signs, positions, self.axes, strict=True))
+        return pan, tilt
 
     def _raise_pending(self) -> None:
         if self._closed:
@@ -720,13 +739,13 @@ def _checked(link: HeadLink) -> HeadLink:
     return link
 
 
-def compare(config: PolledHeadSettings, axes: tuple[AxisFacts, AxisFacts]) -> None:
+def compare(config: PolledHeadSettings, axes: Sequence[AxisFacts], address: str) -> None:
     """Refuse a unit whose steps or limits differ from rig.toml; the message has both, and what to write."""
-    steps = [math.degrees(axis.step) for axis in axes]
+    steps = [math.degrees(axis.step * axis.unit) for axis in axes]
     if any(abs(step - said) > STEP_SHARE * said for step, said in zip(steps, config.steps_deg, strict=True)):
         own, said = (tuple(float(f"{step:.6g}") for step in each) for each in (steps, config.steps_deg))
         raise ConfigError(
-            f"hardware.head.step_deg: pan and tilt of the unit at {config.port} have steps of {own[0]:.6g} and "
+            f"hardware.head.step_deg: pan and tilt of the unit at {address} have steps of {own[0]:.6g} and "
             f"{own[1]:.6g} degrees, not {said[0]:.6g} and {said[1]:.6g}; write step_deg = "
             f"{own[0] if own[0] == own[1] else list(own)}, or change the unit's step mode"
         )
@@ -738,7 +757,7 @@ def compare(config: PolledHeadSettings, axes: tuple[AxisFacts, AxisFacts]) -> No
         if not _agree(found, expected):
             turned = f", or {word}_sign = {-sign}" if _agree(axis.degrees(-sign), expected) else ""
             raise ConfigError(
-                f"hardware.head.{word}_deg: the unit at {config.port} goes from {found[0]:.1f} to {found[1]:.1f} "
+                f"hardware.head.{word}_deg: the unit at {address} goes from {found[0]:.1f} to {found[1]:.1f} "
                 f"degrees, not from {expected[0]:g} to {expected[1]:g}; write {word}_deg = "
                 f"[{found[0]:.1f}, {found[1]:.1f}]{turned}"
             )
@@ -748,33 +767,41 @@ def _agree(found: tuple[float, float], expected: tuple[float, float]) -> bool:
     return max(abs(a - b) for a, b in zip(found, expected, strict=True)) <= LIMITS_DEG
 
 
-def _limits(axes: tuple[AxisFacts, AxisFacts], config: PolledHeadSettings) -> PanTiltLimits:
-    """Convert the unit's limits to radians with the signs of rig.toml; the step is the coarser one."""
-    pan, tilt = axes
-    return PanTiltLimits(
-        pan=_radians(pan.degrees(config.pan_sign)),
-        tilt=_radians(tilt.degrees(config.tilt_sign)),
-        speed=min(math.radians(config.speed_deg_s), *(axis.fastest * axis.step for axis in axes)),
-        acceleration=min(axis.acceleration * axis.step for axis in axes),
-        step=max(axis.step for axis in axes),
-        slack=max(axis.slack * axis.step for axis in axes),
-    )
-
-
-def _radians(degrees: tuple[float, float]) -> tuple[float, float]:
-    return math.radians(degrees[0]), math.radians(degrees[1])
-
-
-def _steps(speed: float, axis: AxisFacts) -> int:
-    """Convert a speed [rad/s] to steps/s, rounded down, within the axis' bounds."""
-    return min(max(math.floor(speed / axis.step * (1 + ROUNDING)), axis.slowest, 1), axis.fastest)
-
-
-def _refuse_too_slow(key: str, cap_deg_s: float | None, axes: tuple[AxisFacts, AxisFacts], port: str) -> None:
+def _refuse_too_slow(key: str, cap_deg_s: float | None, axes: Sequence[AxisFacts], address: str) -> None:
     """Refuse a speed cap below the unit's lowest speed, and name that speed."""
-    slowest = max(max(axis.slowest, 1) * math.degrees(axis.step) for axis in axes)
+    slowest = max(axis.slowest * math.degrees(axis.unit) for axis in axes)
     if cap_deg_s is not None and cap_deg_s * (1 + ROUNDING) < slowest:
         least = math.ceil(100 * slowest) / 100
         raise ConfigError(
-            f"{key}: {cap_deg_s:g} degrees/s is slower than the unit at {port} can turn; it takes {least:g} at least"
+            f"{key}: {cap_deg_s:g} degrees/s is slower than the unit at {address} can turn; it takes {least:g} at least"
         )
+
+
+class PolledLens:
+    """The zoom lens of a unit that moves it as a third axis: the lens's part of the `ZoomCamera` Protocol."""
+
+    def __init__(self, loop: Loop, positions: LensPositions, raise_pending: Callable[[], None]) -> None:
+        self._loop, self._positions, self._raise_pending = loop, positions, raise_pending
+
+    @property
+    def focal_range(self) -> tuple[float, float]:
+        """Shortest and longest nominal focal length [px]."""
+        return self._positions.focal_range
+
+    def zoom(self, focal_px: float) -> float:
+        """Start the lens moving and return at once the focal length that it will reach [px].
+
+        Raises:
+            DeviceError: an error occurred since the last call of lens or head.
+        """
+        self._raise_pending()
+        position = self._positions.position_for(focal_px)
+        self._loop.requests.add(self._loop.requests.zooms, position)
+        return self._positions.focal_at(position)
+
+    def state(self) -> ZoomState:
+        """Return the focal length of the last poll, at once. Raises as `zoom` does."""
+        self._raise_pending()
+        waiting = bool(self._loop.requests.zooms)  # in this order, as in `PolledHead.state`
+        seen = self._loop.lens_snapshot
+        return ZoomState(self._positions.focal_at(seen.positions[0]), seen.moving or waiting, seen.t)

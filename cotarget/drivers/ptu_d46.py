@@ -12,28 +12,29 @@ from typing import Annotated
 
 from cotarget.config import SafetyConfig
 from cotarget.drivers import ptu_protocol
+from cotarget.drivers.axes import AxisFacts, Poll
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.link_errors import CutError, PositionLostError, RefusedError, ReplyError, SilentError
 from cotarget.drivers.polled_head import (
     NOTHING_SAID,
-    AxisFacts,
     HeadLink,
-    Poll,
+    Pair,
     PolledHead,
     PolledHeadSettings,
-    StepSize,
+    Requests,
     braking_s,
 )
 from cotarget.drivers.ptu_protocol import AXES, DELIMITER, HALT, PATIENCE_S, AxisName, Line, command, open_line
 from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.rig import Clock
-from cotarget.schema import Limits, OneOf, Positive, model
+from cotarget.schema import Limits, Needed, OneOf, Positive, model
 
 log = logging.getLogger(__name__)
 BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 GREETINGS = 2  # to a unit that was interrupted in the middle of an exchange
 GREETING_QUIET_S, GREETING_MOST_S = 0.25, 1.5  # [s]; at open the unit's last command is unknown
+ROUNDING = 1e-9  # relative; keeps a speed of whole steps/s from being rounded down after its conversion from degrees
 STILL_S = 0.035  # longer than the slowest speed, 31 steps/s, takes for a step [s]
 # A delimiter before the halt ends what noise may have left at the unit; the unit refuses that and not the halt.
 HALT_NOW, HALT_TRIES = DELIMITER + HALT, 2
@@ -44,11 +45,13 @@ class D46Settings(PolledHeadSettings):
     """A Directed Perception PTU-D46.
 
     Attributes:
+        port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
         baud: baud rate of the serial line.
         pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as in the D46's manual.
     """
 
-    step_deg: StepSize = 0.0514286
+    port: Annotated[str, Needed("/dev/ttyUSB0")] = ""
+    step_deg: Positive | Annotated[tuple[Positive, Positive], "[pan, tilt]"] = 0.0514286
     pan_deg: Limits = (-158.9, 158.9)
     tilt_deg: Limits = (-46.6, 31.1)
     pan_sign: Annotated[int, OneOf(-1, 1)] = -1
@@ -66,7 +69,7 @@ class UnitInfo:
     tilt: AxisFacts
 
     @property
-    def limits(self) -> tuple[int, int, int, int]:
+    def limits(self) -> tuple[float, float, float, float]:
         """Lowest and highest pan, lowest and highest tilt [steps]."""
         return self.pan.lowest, self.pan.highest, self.tilt.lowest, self.tilt.highest
 
@@ -96,13 +99,12 @@ class D46Link(HeadLink):
         self.unit: UnitInfo = connect(line)
         self.axes = self.unit.pan, self.unit.tilt
         self._next = 0  # the axis to poll
-        self._goals: list[int | None] = [None, None]  # that the unit has [steps]; None after a halt
+        self._goals: list[float | None] = [None, None]  # that the unit has [steps]; None after a halt
         self._speeds: list[int | None] = [None, None]  # that the unit has [steps/s]
-        line.hurry = lambda: self.hurry()
 
-    def poll(self) -> Sequence[Poll]:
+    def poll(self, requests: Requests) -> Sequence[Poll]:
         """Ask for the position of one axis, in turn."""
-        axis = self._next
+        self._line.hurry, axis = requests.halt_waits, self._next
         order = command(AXES[axis] + "P")
         position, t = self._line.query(
             order, ptu_protocol.bare_integer, even_if_refused=True, resynchronized=self._refuse_cut
@@ -110,16 +112,17 @@ class D46Link(HeadLink):
         self._next = 1 - axis
         return [Poll(axis, position, t)]
 
-    def move(self, goals: tuple[int, int], speeds: tuple[int, int], proceed: Callable[[], None]) -> None:
-        """Send the speeds and positions that have changed."""
-        for axis, speed in enumerate(speeds):
-            if speed != self._speeds[axis]:
-                self._order(AXES[axis] + "S", speed, proceed)
+    def move(self, goals: Pair, speeds: Pair, requests: Requests) -> None:
+        """Send the speeds, rounded down to whole steps/s, and the positions that have changed."""
+        self._line.hurry = requests.halt_waits
+        for axis, fastest in enumerate(speeds):
+            if (speed := max(math.floor(fastest * (1 + ROUNDING)), 1)) != self._speeds[axis]:
+                self._order(AXES[axis] + "S", speed, requests)
                 self._speeds[axis] = speed
         for axis, goal in enumerate(goals):
             if goal != self._goals[axis]:
                 self._goals[axis] = None
-                self._order(AXES[axis] + "P", goal, proceed)
+                self._order(AXES[axis] + "P", round(goal), requests)
                 self._goals[axis] = goal
 
     def halt(self, patience: float) -> None:
@@ -143,12 +146,16 @@ class D46Link(HeadLink):
         """Release the port."""
         self._line.close()
 
-    def _order(self, name: str, value: int, proceed: Callable[[], None]) -> None:
+    def _order(self, name: str, value: int, requests: Requests) -> None:
         def resynchronized(error: DeviceError, halted: bool) -> None:
             self._refuse_cut(error, halted)
-            proceed()
+            may_proceed()
 
-        proceed()
+        def may_proceed() -> None:
+            self.check()
+            requests.proceed()
+
+        may_proceed()
         self._line.query(command(name, value), ptu_protocol.done, resynchronized=resynchronized)
 
     def _refuse_cut(self, error: DeviceError, halted: bool) -> None:
@@ -281,7 +288,7 @@ class UncalibratedError(DeviceError):
     """The unit has not found its limits."""
 
 
-def refuse_uncalibrated(name: str, limits: Sequence[int]) -> None:
+def refuse_uncalibrated(name: str, limits: Sequence[float]) -> None:
     """Refuse a unit that has not found its limits: lowest and highest pan, lowest and highest tilt [steps].
 
     Raises:
@@ -301,14 +308,23 @@ def _axis(line: Line, axis: AxisName) -> AxisFacts:
 
     arcseconds, _ = line.query(command(axis + "R"), ptu_protocol.arcseconds, PATIENCE_S)
     step = math.radians(arcseconds / ptu_protocol.ARCSECONDS)
-    facts = AxisFacts(step, number("N"), number("X"), number("L"), number("U"), number("A"), STILL_S)
-    if not 0 <= facts.slowest <= facts.fastest or min(facts.fastest, facts.acceleration) <= 0:
+    lowest, highest, slowest, fastest, acceleration = (number(what) for what in ("N", "X", "L", "U", "A"))
+    if not 0 <= slowest <= fastest or min(fastest, acceleration) <= 0:
         raise DeviceError(
             f"the pan-tilt unit at {line.name} reports for {ptu_protocol.AXIS_WORDS[axis]} speeds "
-            f"from {facts.slowest} to {facts.fastest} and an acceleration of {facts.acceleration}; "
-            "restore its factory settings"
+            f"from {slowest} to {fastest} and an acceleration of {acceleration}; restore its factory settings"
         )
-    return facts
+    return AxisFacts(
+        unit=step,
+        lowest=lowest,
+        highest=highest,
+        fastest=fastest,
+        slowest=max(slowest, 1),
+        acceleration=acceleration,
+        step=1.0,
+        still_s=STILL_S,
+        loses_steps=True,
+    )
 
 
 def _text(line: Line, question: str) -> str:

@@ -1,11 +1,10 @@
 """Open the real devices as one Rig; every exit halts the head and releases all devices."""
 
 import contextlib
-import ipaddress
 import math
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from numbers import Integral, Real
 from pathlib import Path
@@ -17,7 +16,7 @@ from cotarget.config import HardwareConfig, RigConfig
 from cotarget.drivers import DRIVERS
 from cotarget.drivers.board import BoardSettings, make_board
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.interlock import rig_lock
+from cotarget.drivers.interlock import addresses_of, rig_lock
 from cotarget.errors import ConfigError, choices
 from cotarget.plugins import FORM, Answer, Reporting, calling, check_attribute, is_own, load
 from cotarget.rig import (
@@ -39,15 +38,6 @@ from cotarget.schema import missing_key, validate
 # Measurements: docs/design-notes.md.
 SWITCH_INTERVAL = 5e-4
 KEY = "driver"
-ADDRESS_KEYS = ("port", "host", "url", "address")  # of settings that say where a device is
-
-
-def _is_ip(text: str) -> bool:
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _is_frame(answer: object) -> bool:
@@ -153,23 +143,9 @@ class Device:
         return spec
 
     @property
-    def addresses(self) -> tuple[str, ...]:
-        """The addresses in the settings: a serial port, HOST, HOST:PORT or a URL.
-
-        They are what the keys `port`, `host`, `url` and `address` hold, and what is an address by its form: an IP
-        address, a path in /dev, or a URL. A number in `port` is the port of that host.
-        """
-        number = getattr(self.settings, "port", "")
-        port = str(number) if str(number).isdigit() and int(number) else ""
-        found = []
-        for key, value in vars(self.settings).items():
-            if not isinstance(value, str) or not value or (key == "port" and value.isdigit()):
-                continue
-            if (is_ip := _is_ip(value)) or key in ADDRESS_KEYS or "://" in value or value.startswith("/dev/"):
-                is_host = "://" not in value and "/" not in value and key != "port"
-                host = f"[{value}]" if is_ip and ":" in value else value  # version 6
-                found.append(f"{host}:{port}" if is_host and port else host)
-        return tuple(dict.fromkeys(found))
+    def address(self) -> str:
+        """The device's own address, such as its port; empty if the settings name none."""
+        return next(iter(addresses_of(self.settings)), "")
 
     def refuse_missing(self) -> None:
         """Refuse settings that lack what opening the device needs.
@@ -194,7 +170,7 @@ class Device:
             raise ConfigError("is not configured")
         if not hasattr(self.driver, "probe"):
             return None
-        lock = rig_lock(*self.addresses) if self.role in ("head", "ptz") else contextlib.nullcontext()
+        lock = rig_lock(*addresses_of(self.settings)) if self.role in ("head", "ptz") else contextlib.nullcontext()
         with lock, calling(self.where):
             return str(self.driver.probe(self.settings))
 
@@ -328,40 +304,79 @@ def _spec(found: Mapping[str, Device]) -> RigSpec:
     return RigSpec(fixed, zoom, head, real_time=True)
 
 
-def open_hardware(config: RigConfig, file: Path | None = None) -> Rig:
+class Missing:
+    """Stands in for a device that rig.toml does not configure: every call but a halt is an error that says so.
+
+    Args:
+        error: what each call raises.
+        known: attributes, as the default settings describe them.
+    """
+
+    def __init__(self, error: ConfigError, known: Mapping[str, Any]) -> None:
+        self._error = error
+        self.__dict__.update(known)
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        def refuse(*arguments: Any, **options: Any) -> Any:
+            raise self._error
+
+        return refuse
+
+    def halt(self) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def open_hardware(config: RigConfig, file: Path | None = None, partial: bool = False) -> Rig:
     """Open the devices of a configuration; the head comes last and does not move where another device is missing.
 
     Shortens the thread switch interval of this process (`SWITCH_INTERVAL`). No second program may open the rig of
     ``file``, its rig.toml.
 
+    Args:
+        config: the configuration.
+        file: its rig.toml.
+        partial: whether devices that are not configured may be missing, see `Rig.missing`.
+
     Raises:
         ConfigError: a device is not named, or differs from the configuration.
         DeviceError: a device could not be opened, or another program uses it.
     """
-    found = devices(config.hardware)
-    for device in found.values():
-        device.refuse_missing()
+    found, missing = devices(config.hardware), dict[str, ConfigError]()
+    for role, device in found.items():
+        try:
+            device.refuse_missing()
+        except ConfigError as error:
+            missing |= dict.fromkeys(("zoom", "head") if device.role == "ptz" else (role,), error)
+    if missing and (not partial or missing.keys() >= found.keys()):
+        raise next(iter(missing.values()))
     sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
     clock, spec = MonotonicClock(), _spec(found)
     with contextlib.ExitStack() as opened:
-        opened.enter_context(rig_lock(*found["head"].addresses, file=file))
+
+        def opening(role: str, known: Sequence[str], *arguments: Any) -> Any:
+            if role in missing:
+                described = getattr(spec, role)
+                return Missing(missing[role], {name: getattr(described, name) for name in known})
+            return opened.enter_context(contextlib.closing(found[role].open(clock, *arguments)))
+
+        opened.enter_context(rig_lock(*addresses_of(found["head"].settings), file=file))
         board = opened.enter_context(contextlib.closing(make_board(board_settings(config.hardware))))
-        fixed = opened.enter_context(contextlib.closing(found["fixed"].open(clock)))
-        if "zoom" in found:
-            zoom = opened.enter_context(contextlib.closing(found["zoom"].open(clock)))
-            head = opened.enter_context(contextlib.closing(found["head"].open(clock, config.safety)))
-        else:
+        fixed = opening("fixed", ("size",))
+        if found["head"].role == "ptz" and "head" not in missing:
             unit = opened.enter_context(contextlib.closing(found["head"].open_unit(clock, config.safety)))
             zoom, head = unit.zoom, unit.head
+        else:
+            zoom = opening("zoom", ("size", "still_size", "focal_range"))
+            head = opening("head", ("limits",), config.safety)
         reported = replace(
             spec,
             fixed=replace(spec.fixed, size=fixed.size),
             zoom=replace(spec.zoom, size=zoom.size, focal_range=zoom.focal_range, still_size=zoom.still_size),
             head=replace(spec.head, limits=head.limits),
         )
-        return Rig(fixed, zoom, head, clock, board, reported, opened.pop_all().close, config)
-
-
-def port_of(device: Device) -> str:
-    """Return the port that a device's settings name; empty if they name none."""
-    return str(getattr(device.settings, "port", ""))
+        return Rig(
+            fixed, zoom, head, clock, board, reported, opened.pop_all().close, config, missing=frozenset(missing)
+        )

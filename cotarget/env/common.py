@@ -171,7 +171,7 @@ class Units:
     def of(cls, config: RigConfig) -> "Units":
         """Make the units of a rig, with the head's soft limits."""
         spec = describe(config)
-        return cls(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range)
+        return cls(spec.head.limits.pan.range, spec.head.limits.tilt.range, spec.zoom.focal_range)
 
     def command(self, action: npt.ArrayLike) -> Command:
         """Convert an action (pan, tilt, focal length), clipped to -1 to 1, to a command.

@@ -24,8 +24,7 @@ from cotarget.env.follow import Follow
 from cotarget.env.schedule import Schedule
 from cotarget.errors import ConfigError
 from cotarget.pipeline import FollowSettings, Step, follow
-from cotarget.rig import Frame, PanTiltLimits, PanTiltState, Speed
-from cotarget.safety.safe_rig import clipped
+from cotarget.rig import AxisLimits, Frame, PanTiltLimits, PanTiltState, Speed
 
 NEAR = 1e-6  # tolerance of an angle [rad]
 
@@ -59,18 +58,18 @@ class EnvironmentRig:
         state, request = self._head.state(), self._head.request
         self._model.add_report(state)
         if request is None:
-            return *clipped(state.pan, state.tilt, self._head.limits), self._zoom.request
+            return *self._head.limits.clip(state.pan, state.tilt), self._zoom.request
         pan, tilt = request.pan, request.tilt
         effect = self.rig.clock.now() + self.rig.spec.head.delay_s
         if request.speed is not None:
             speeds = self._head.limits.capped(request.speed)
-            axes = zip(self._model.motion_at(effect), (pan, tilt), speeds, strict=True)
-            pan, tilt = (self._hurried(x, v, goal, speed) for (x, v), goal, speed in axes)
-            pan, tilt = clipped(pan, tilt, self._head.limits)
+            axes = zip(self._model.motion_at(effect), (pan, tilt), speeds, self._head.limits.axes, strict=True)
+            pan, tilt = (self._hurried(x, v, goal, speed, axis) for (x, v), goal, speed, axis in axes)
+            pan, tilt = self._head.limits.clip(pan, tilt)
         self._model.add_command(effect, HeadCommand(pan, tilt, None))
         return pan, tilt, self._zoom.request
 
-    def _hurried(self, x: float, v: float, goal: float, speed: float) -> float:
+    def _hurried(self, x: float, v: float, goal: float, speed: float, axis: AxisLimits) -> float:
         """Find the goal that at full speed brings an axis as far by the next step as a slower command would [rad].
 
         Args:
@@ -78,14 +77,15 @@ class EnvironmentRig:
             v: speed [rad/s].
             goal: goal of the slower command [rad].
             speed: speed of the slower command [rad/s].
+            axis: limits of the axis.
         """
-        limits, interval = self._head.limits, self._interval
-        there, _ = axis_at(interval, x, v, goal, speed, limits.acceleration)
+        interval, acceleration = self._interval, axis.assumed_acceleration
+        there, _ = axis_at(interval, x, v, goal, speed, acceleration)
 
         def beyond(end: float) -> float:
-            return axis_at(interval, x, v, end, limits.speed, limits.acceleration)[0] - there
+            return axis_at(interval, x, v, end, axis.speed, acceleration)[0] - there
 
-        far = abs(goal - x) + v * v / limits.acceleration + limits.speed * interval
+        far = abs(goal - x) + v * v / acceleration + axis.speed * interval
         if beyond(x - far) >= 0 or beyond(x + far) <= 0:
             return goal
         return float(brentq(beyond, x - far, x + far, xtol=NEAR))
@@ -131,7 +131,7 @@ class EnvironmentHead:
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """Store the requested command, within the limits."""
-        pan, tilt = clipped(pan, tilt, self.limits)
+        pan, tilt = self.limits.clip(pan, tilt)
         self.request = HeadCommand(pan, tilt, speed)
         return pan, tilt
 

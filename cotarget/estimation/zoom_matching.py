@@ -69,7 +69,7 @@ class MatchingSettings:
     sigma_px: float = 0.08
     least_sigma_px: float = 1.0
     longest_apart_s: float = 0.1
-    latest_s: float = 0.5
+    latest_s: float = 1.2
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,18 @@ from cotarget.config import RigConfig, parse_config
 from cotarget.control.selection import check_selector_table
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform
-from cotarget.rig import CameraSpec, Frame, HeadSpec, Image, PanTiltLimits, PanTiltState, RigSpec, ZoomSpec, ZoomState
+from cotarget.rig import (
+    AxisLimits,
+    CameraSpec,
+    Frame,
+    HeadSpec,
+    Image,
+    PanTiltLimits,
+    PanTiltState,
+    RigSpec,
+    ZoomSpec,
+    ZoomState,
+)
 
 SCHEMA = 1
 META, LOG, CALIBRATION, TEMPLATE = "recording.json", "log.jsonl", "calibration.json", "template"
@@ -102,8 +113,10 @@ def result_numbers(result: Any) -> tuple[Number, ...]:
             return ()
         case Frame():
             return (result.t,)
-        case ZoomState() | PanTiltState():
+        case ZoomState():
             return dataclasses.astuple(result)
+        case PanTiltState():
+            return (*dataclasses.astuple(result)[:4], *([result.sigma] if result.sigma else []))
     return _numbers_of(result)
 
 
@@ -178,21 +191,27 @@ def spec_table(spec: RigSpec) -> dict[str, Any]:
         "zoom_size": list(zoom.size),
         "still_size": list(zoom.still_size),
         "focal_range_px": [_plain(value) for value in zoom.focal_range],
-        "pan": [_plain(value) for value in limits.pan],
-        "tilt": [_plain(value) for value in limits.tilt],
-        "speed": _plain(limits.speed),
-        "acceleration": _plain(limits.acceleration),
-        "step": _plain(limits.step),
-        **({"slack": _plain(limits.slack)} if limits.slack else {}),
+        "pan": [_plain(value) for value in limits.pan.range],
+        "tilt": [_plain(value) for value in limits.tilt.range],
+        "speed": _of_axes(limits, "speed"),
+        "acceleration": _of_axes(limits, "acceleration"),
+        "step": _of_axes(limits, "step"),
+        **({"slack": _of_axes(limits, "slack")} if limits.pan.slack or limits.tilt.slack else {}),
         "real_time": spec.real_time,
         "fixed_rate_hz": _plain(fixed.rate_hz),
         "fixed_latency_s": _plain(fixed.latency_s),
         "zoom_rate_hz": _plain(zoom.rate_hz),
         "zoom_latency_s": _plain(zoom.latency_s),
-        "zoom_pitch_mm": _plain(zoom.pitch_mm),
+        "zoom_pitch_mm": zoom.pitch_mm and _plain(zoom.pitch_mm),
         "zoom_delay_s": _plain(zoom.delay_s),
         "head_delay_s": _plain(spec.head.delay_s),
     }
+
+
+def _of_axes(limits: PanTiltLimits, name: str) -> float | list[float | None] | None:
+    """Write a limit of both axes: one value where they are equal, else [pan, tilt]; null for what is unknown."""
+    pan, tilt = (None if (value := getattr(axis, name)) is None else _plain(value) for axis in limits.axes)
+    return pan if pan == tilt else [pan, tilt]
 
 
 def parse_spec(table: Mapping[str, Any], described: Callable[[], RigSpec]) -> RigSpec:
@@ -214,18 +233,19 @@ def parse_spec(table: Mapping[str, Any], described: Callable[[], RigSpec]) -> Ri
 
     fixed_size, zoom_size, still_size = size("fixed_size"), size("zoom_size"), size("still_size")
     focal_range = pair("focal_range_px")
-    limits = PanTiltLimits(
-        pair("pan"),
-        pair("tilt"),
-        float(table["speed"]),
-        float(table["acceleration"]),
-        float(table["step"]),
-        float(table.get("slack", 0.0)),
-    )
+
+    def axis(name: str, number: int) -> AxisLimits:
+        own = [table["speed"], table["acceleration"], table["step"], table.get("slack", 0.0)]
+        speed, acceleration, step, slack = (each[number] if isinstance(each, list) else each for each in own)
+        known = None if acceleration is None else float(acceleration)
+        return AxisLimits(pair(name), float(speed), known, float(step), float(slack))
+
+    limits = PanTiltLimits(axis("pan", 0), axis("tilt", 1))
     if "head_delay_s" in table:
         fixed = CameraSpec(fixed_size, float(table["fixed_rate_hz"]), float(table["fixed_latency_s"]))
-        rates = {key: float(table[f"zoom_{key}"]) for key in ("rate_hz", "latency_s", "pitch_mm", "delay_s")}
-        zoom = ZoomSpec(size=zoom_size, focal_range=focal_range, still_size=still_size, **rates)
+        rates = {key: float(table[f"zoom_{key}"]) for key in ("rate_hz", "latency_s", "delay_s")}
+        pitch_mm = None if table["zoom_pitch_mm"] is None else float(table["zoom_pitch_mm"])
+        zoom = ZoomSpec(zoom_size, focal_range=focal_range, still_size=still_size, pitch_mm=pitch_mm, **rates)
         head = HeadSpec(limits, float(table["head_delay_s"]))
     else:
         spec = described()

@@ -23,7 +23,7 @@ import cotarget.errors
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.recording.format import COMPLETE, Event, Recording, argument_numbers, is_same
-from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Rig, Speed, ZoomState
+from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Rig, Speed, ZoomState, to_step
 
 COMMANDS = ("head.move", "zoom.zoom", "head.halt")
 
@@ -374,7 +374,7 @@ class _ZoomCamera(_Camera):
         self._spec = recording.spec.zoom
         self._frames = [e for e in recording.events if e.call == "zoom.read" and e.error is None]
         self._kept = [e for e in self._frames if e.image is not None]
-        states = [e for e in recording.events if e.call == "zoom.state" and e.error is None]
+        states = [e.numbers for e in recording.events if e.call == "zoom.state" and e.error is None]
         self._states = _StateHistory(states)
 
     @property
@@ -434,7 +434,8 @@ class _ZoomCamera(_Camera):
 class _Head:
     def __init__(self, replay: Replay, recording: Recording) -> None:
         self._replay, self._limits = replay, recording.spec.head.limits
-        self._states = _StateHistory([e for e in recording.events if e.call == "head.state" and e.error is None])
+        states = [e.numbers for e in recording.events if e.call == "head.state" and e.error is None]
+        self._states = _StateHistory([numbers[:4] for numbers in states])
 
     @property
     def limits(self) -> PanTiltLimits:
@@ -445,8 +446,8 @@ class _Head:
         if event is None:
             (pan, tilt), moving = self._states.at(self._replay.now, "head")
             return PanTiltState(pan, tilt, moving, self._replay.now)
-        pan, tilt, moves, t = event.numbers
-        return PanTiltState(pan, tilt, bool(moves), t)
+        pan, tilt, moves, t, *sigma = event.numbers
+        return PanTiltState(pan, tilt, bool(moves), t, *sigma)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         recorded = self._replay.take("head.move")
@@ -458,7 +459,10 @@ class _Head:
                 return recorded.numbers[0], recorded.numbers[1]
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
-        return self._possible(pan, self._limits.pan), self._possible(tilt, self._limits.tilt)
+        pan, tilt = (
+            to_step(axis.clip(angle), axis.step) for angle, axis in zip((pan, tilt), self._limits.axes, strict=True)
+        )
+        return pan, tilt
 
     def halt(self) -> None:
         try:
@@ -466,13 +470,6 @@ class _Head:
         except CotargetError:
             if not self._replay.breaks_off:  # a halt that failed when the recorded rig was closed leaves nothing moving
                 raise
-
-    def _possible(self, angle: float, limits: tuple[float, float]) -> float:
-        step = self._limits.step
-        low, high = limits
-        if step <= 0:
-            return min(max(angle, low), high)
-        return min(max(round(angle / step), math.ceil(low / step)), math.floor(high / step)) * step
 
 
 class _Clock:
@@ -501,8 +498,8 @@ class _Board:
 class _StateHistory:
     """Recorded states of a device: numbers, whether it moved, and the time."""
 
-    def __init__(self, events: Sequence[Event]) -> None:
-        rows = np.array([event.numbers for event in events], dtype=float)
+    def __init__(self, states: Sequence[Sequence[float]]) -> None:
+        rows = np.array(states, dtype=float)
         self._rows = rows[np.argsort(rows[:, -1], kind="stable")] if len(rows) else rows
 
     def at(self, t: float, device: str) -> tuple[list[float], bool]:

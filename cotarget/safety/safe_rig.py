@@ -6,15 +6,16 @@ simulation time passes only inside calls, so each call runs the watchdog, and a 
 
 import atexit
 import contextlib
-import dataclasses
 import logging
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 from cotarget.config import SafetyConfig
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from cotarget.rig import (
     FUTURE_S,
+    AxisLimits,
     Camera,
     Clock,
     Frame,
@@ -69,12 +70,12 @@ class SafeHead:
             EmergencyStopError: the head is stopped.
             DeviceError: an angle is not finite, a speed is not above zero, or the device failed or left the limits.
         """
-        pan, tilt = clipped(pan, tilt, self._limits)
+        pan, tilt = self._limits.clip(pan, tilt)
         speeds = self._limits.capped(speed)
         asked: Speed | None = speeds
         if speeds[0] == speeds[1]:  # a driver need not know of a speed for each axis
             asked = None if math.isinf(speeds[0]) else speeds[0]
-        motion = self._watchdog.begin((pan, tilt), self._patience((pan, tilt), min(speeds)) if wait else 0.0)
+        motion = self._watchdog.begin((pan, tilt), self._patience((pan, tilt), speeds) if wait else 0.0)
         try:
             said = self._head.move(pan, tilt, asked, wait)
         except BaseException as error:
@@ -83,7 +84,8 @@ class SafeHead:
             raise
         if self._watchdog.end(motion, arrived=wait):
             self._watchdog.refuse_if_stopped()
-        if not (_inside(said[0], self._limits.pan, self._limits) and _inside(said[1], self._limits.tilt, self._limits)):
+        pairs = zip(said, self._limits.axes, strict=True)
+        if not all(axis.beyond(angle) <= axis.step + ANGLE_ROUNDING for angle, axis in pairs):  # nor is nan
             self._watchdog.halt()
             raise DeviceError(
                 f"the head was sent to pan {math.degrees(pan):.3f}, tilt {math.degrees(tilt):.3f} degrees and says "
@@ -95,23 +97,17 @@ class SafeHead:
         """Stop both axes at once."""
         self._watchdog.halt()
 
-    def _patience(self, goal: tuple[float, float], speed: float) -> float:
+    def _patience(self, goal: tuple[float, float], speeds: tuple[float, float]) -> float:
         """Estimate how long the device may wait for the head to arrive [s]."""
-        acceleration = self._limits.acceleration
-        if math.isinf(speed):
+        if math.isinf(min(speeds)):
             return 0.0  # only a simulated head has infinite speed, and its wait is not watched
-        state = self._head.state()
-        way = max(abs(goal[0] - state.pan), abs(goal[1] - state.tilt))
-        peak = min(speed, math.sqrt(way * acceleration))
-        from_rest = way / peak + peak / acceleration if way > 0 else 0.0
-        # A head that turns the other way must brake first, and then come back.
-        return ARRIVAL_S + SLOWNESS * (from_rest + (2 * self._limits.speed / acceleration if state.moving else 0.0))
-
-
-def _inside(angle: float, bounds: tuple[float, float], limits: PanTiltLimits) -> bool:
-    """Return whether an angle is within bounds, with a tolerance of one step; nan is not."""
-    slack = limits.step + ANGLE_ROUNDING
-    return bounds[0] - slack <= angle <= bounds[1] + slack
+        state, longest = self._head.state(), 0.0
+        ways = (goal[0] - state.pan, goal[1] - state.tilt)
+        for way, speed, axis in zip(ways, speeds, self._limits.axes, strict=True):
+            # A head that turns the other way must brake first, and then come back.
+            back_s = 2 * axis.braking_s if state.moving else 0.0
+            longest = max(longest, replace(axis, speed=speed).travel_s(way) + back_s)
+        return ARRIVAL_S + SLOWNESS * longest
 
 
 class SafeCamera:
@@ -245,8 +241,6 @@ class SafeClock:
 
 # Soft limits and speed cap
 
-STEP_ROUNDING = 1e-9  # in steps; keeps a limit of whole steps whole after its conversion from degrees
-
 
 def soft_limits(device: PanTiltLimits, config: SafetyConfig) -> PanTiltLimits:
     """Combine the device's limits with the configured ones; the tighter ones hold.
@@ -254,60 +248,35 @@ def soft_limits(device: PanTiltLimits, config: SafetyConfig) -> PanTiltLimits:
     Raises:
         ConfigError: no angle is left, or a limit is not finite.
     """
-    # Nan is none of these.
-    if not (
-        device.speed > 0 and device.acceleration > 0 and 0 <= device.step < math.inf and 0 <= device.slack < math.inf
-    ):
-        raise ConfigError(
-            f"the head reports a speed of {device.speed}, an acceleration of {device.acceleration}, a step of "
-            f"{device.step} and a slack of {device.slack}; correct its driver"
-        )
-    return dataclasses.replace(
-        device,
-        pan=_within(config.pan_deg, device.pan, device.step, "safety.pan_deg"),
-        tilt=_within(config.tilt_deg, device.tilt, device.step, "safety.tilt_deg"),
-        speed=device.speed if config.speed_deg_s is None else min(device.speed, math.radians(config.speed_deg_s)),
+    most = math.inf if config.speed_deg_s is None else math.radians(config.speed_deg_s)
+    return PanTiltLimits(
+        _tighter(device.pan, config.pan_deg, most, "pan"), _tighter(device.tilt, config.tilt_deg, most, "tilt")
     )
 
 
-def clipped(pan: float, tilt: float, limits: PanTiltLimits) -> tuple[float, float]:
-    """Clip angles [rad] to the limits, or to the outermost step inside them, so that rounding cannot lead outside.
-
-    Raises:
-        DeviceError: an angle is not finite.
-    """
-    if not (math.isfinite(pan) and math.isfinite(tilt)):
-        raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
-    return _clip(pan, limits.pan, limits.step), _clip(tilt, limits.tilt, limits.step)
-
-
-def _within(
-    soft_deg: tuple[float, float] | None, device: tuple[float, float], step: float, name: str
-) -> tuple[float, float]:
-    """Intersect soft limits [degrees] with the device's [rad]."""
-    own = [round(math.degrees(v), 1) for v in device]
-    if not device[0] <= device[1]:  # nor is nan
-        raise ConfigError(f"{name}: the head reports a range of {own}, which is none; correct its driver")
+def _tighter(axis: AxisLimits, soft_deg: tuple[float, float] | None, speed: float, name: str) -> AxisLimits:
+    """Intersect an axis's own limits with soft ones [degrees] and a speed cap [rad/s]."""
+    # Nan is none of these.
+    if not (
+        axis.speed > 0 and axis.assumed_acceleration > 0 and 0 <= axis.step < math.inf and 0 <= axis.slack < math.inf
+    ):
+        raise ConfigError(
+            f"the head reports for {name} a speed of {axis.speed}, an acceleration of {axis.acceleration}, a step of "
+            f"{axis.step} and a slack of {axis.slack}; correct its driver"
+        )
+    key, own = f"safety.{name}_deg", [round(math.degrees(v), 1) for v in axis.range]
+    if not axis.range[0] <= axis.range[1]:  # nor is nan
+        raise ConfigError(f"{key}: the head reports a range of {own}, which is none; correct its driver")
+    limits = replace(axis, speed=min(axis.speed, speed))
     if soft_deg is None:
-        if not all(map(math.isfinite, device)):
-            raise ConfigError(f"{name}: is missing; the head reports no end of its range, {own}")
-        return device
-    low, high = max(math.radians(soft_deg[0]), device[0]), min(math.radians(soft_deg[1]), device[1])
-    first, last = _outermost((low, high), step)
+        if not all(map(math.isfinite, axis.range)):
+            raise ConfigError(f"{key}: is missing; the head reports no end of its range, {own}")
+        return limits
+    low, high = max(math.radians(soft_deg[0]), axis.range[0]), min(math.radians(soft_deg[1]), axis.range[1])
+    limits = replace(limits, range=(low, high))
+    first, last = limits.outermost()
     if low >= high or first > last:
-        raise ConfigError(f"{name}: {list(soft_deg)} leaves nothing of the device's own range {own}")
-    return low, high
-
-
-def _clip(angle: float, limits: tuple[float, float], step: float) -> float:
-    low, high = _outermost(limits, step)
-    return min(max(angle, low), high)
-
-
-def _outermost(limits: tuple[float, float], step: float) -> tuple[float, float]:
-    """Return the outermost steps inside the limits; the limits themselves for a head without steps."""
-    if step > 0:
-        return math.ceil(limits[0] / step - STEP_ROUNDING) * step, math.floor(limits[1] / step + STEP_ROUNDING) * step
+        raise ConfigError(f"{key}: {list(soft_deg)} leaves nothing of the device's own range {own}")
     return limits
 
 
@@ -336,13 +305,13 @@ def guard(rig: Rig, config: SafetyConfig) -> Rig:
         refuse_if_stopped(config.stop_file)
         limits = soft_limits(rig.head.limits, config)
         watchdog, max_age_s = behind.watchdog, config.max_frame_age_s
-        guarded = dataclasses.replace(
+        guarded = replace(
             rig,
             fixed=SafeCamera(rig.fixed, rig.clock, watchdog, max_age_s, "fixed"),
             zoom=SafeZoomCamera(rig.zoom, rig.clock, watchdog, max_age_s),
             head=SafeHead(rig.head, limits, watchdog),
             clock=rig.clock if rig.spec.real_time else SafeClock(rig.clock, watchdog),
-            spec=dataclasses.replace(rig.spec, head=dataclasses.replace(rig.spec.head, limits=limits)),
+            spec=replace(rig.spec, head=replace(rig.spec.head, limits=limits)),
             release=behind.close,
             guard=behind,
         )

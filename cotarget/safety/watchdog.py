@@ -134,16 +134,19 @@ class Watchdog:
             motion = self._motion
             if motion is None or motion.on_its_way or state.moving or state.t < motion.t:
                 return
-            off = max(abs(state.pan - motion.goal[0]), abs(state.tilt - motion.goal[1]))
-            if off <= limits.tolerance + AT_GOAL:
+            offs = (abs(state.pan - motion.goal[0]), abs(state.tilt - motion.goal[1]))
+            if all(off <= axis.tolerance + AT_GOAL for off, axis in zip(offs, limits.axes, strict=True)):
                 self._motion = None
 
     def _check_inside(self, state: PanTiltState, limits: PanTiltLimits) -> None:
         """Stop a head that was within the soft limits and is not any more; warn of one that is outside of them."""
         if state.t < self._called_t:
             return
-        off = max(max(low - q, q - high) for q, (low, high) in ((state.pan, limits.pan), (state.tilt, limits.tilt)))
-        was_inside, self._is_inside = self._is_inside, off <= limits.tolerance + OUTSIDE
+        angles = zip((state.pan, state.tilt), limits.axes, strict=True)
+        was_inside, self._is_inside = (
+            self._is_inside,
+            all(axis.beyond(q) <= axis.tolerance + OUTSIDE for q, axis in angles),
+        )
         if self._is_inside or was_inside is False:
             return
         place = f"pan {math.degrees(state.pan):.1f}, tilt {math.degrees(state.tilt):.1f} degrees"

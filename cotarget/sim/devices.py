@@ -12,6 +12,7 @@ from cotarget.config import RigConfig, SimCamera, SimEffects, SimHead, SimZoomCa
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import (
+    AxisLimits,
     CameraSpec,
     Clock,
     Frame,
@@ -25,7 +26,6 @@ from cotarget.rig import (
     ZoomState,
     to_step,
 )
-from cotarget.safety.safe_rig import clipped
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
 # Frame times are multiples of the frame period. This part of a period [1] absorbs their rounding.
@@ -183,12 +183,10 @@ def rig_spec(config: RigConfig) -> RigSpec:
     """Describe the configured simulated rig."""
     fixed, zoom, head, effects = config.sim.fixed, config.sim.zoom, config.sim.head, config.sim.effects
     axes, lens = head_drive(head, effects), lens_drive(zoom, effects)
-    limits = PanTiltLimits(
-        pan=(math.radians(head.pan_deg[0]), math.radians(head.pan_deg[1])),
-        tilt=(math.radians(head.tilt_deg[0]), math.radians(head.tilt_deg[1])),
-        speed=axes.pan.speed,
-        acceleration=axes.pan.acceleration,
-        step=math.radians(head.step_deg) if effects.steps else 0.0,
+    step = math.radians(head.step_deg) if effects.steps else 0.0
+    pan, tilt = (
+        AxisLimits((math.radians(low), math.radians(high)), axis.speed, axis.acceleration, step)
+        for (low, high), axis in ((head.pan_deg, axes.pan), (head.tilt_deg, axes.tilt))
     )
     delay_s = head.command_delay_s if effects.command_delay else 0.0
     latency_s = (fixed.latency_s, zoom.latency_s) if effects.latency else (0.0, 0.0)
@@ -203,7 +201,7 @@ def rig_spec(config: RigConfig) -> RigSpec:
             still_size=zoom.size,
             delay_s=delay_s,  # the lens starts after the head's command delay
         ),
-        head=HeadSpec(limits, delay_s),
+        head=HeadSpec(PanTiltLimits(pan, tilt), delay_s),
         targets=config.sim.targets,
     )
 
@@ -219,7 +217,8 @@ class SimPanTilt:
     def state(self) -> PanTiltState:
         """Give the angles that the unit's step counters show now; backlash is not visible in them."""
         now = self._clock.now()
-        pan, tilt = (to_step(axis.motor(now)[0], self.limits.step) for axis in (self._drive.pan, self._drive.tilt))
+        pan = to_step(self._drive.pan.motor(now)[0], self.limits.pan.step)
+        tilt = to_step(self._drive.tilt.motor(now)[0], self.limits.tilt.step)
         return PanTiltState(pan, tilt, now < self._rests, now)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
@@ -228,10 +227,9 @@ class SimPanTilt:
         Raises:
             DeviceError: an angle is not finite.
         """
-        if not (math.isfinite(pan) and math.isfinite(tilt)):
-            raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
+        pan, tilt = self.limits.clip(pan, tilt)
         speeds = self.limits.capped(speed)
-        pan, tilt = (to_step(angle, self.limits.step) for angle in clipped(pan, tilt, self.limits))
+        pan, tilt = to_step(pan, self.limits.pan.step), to_step(tilt, self.limits.tilt.step)
         t = self._clock.now() + self._delay
         self._rests = max(self._drive.pan.command(t, pan, speeds[0]), self._drive.tilt.command(t, tilt, speeds[1]))
         if wait:

@@ -85,7 +85,7 @@ def one(settings: ZoomRangeSettings, seed: int) -> list[Row]:
                 if HEADS[head]:
                     for name, one_calibration in (("rounded", calibration), ("rounding", exact)):
                         rng = np.random.default_rng((seed, STREAM, i))
-                        rounded = judged(one_calibration, rng=rng, step=reach.step)
+                        rounded = judged(one_calibration, rng=rng, step=reach.steps[0])
                         row[f"{name}_rms_deg"] = rms(np.degrees(rounded))
                 rows.append(row)
     return rows

@@ -252,7 +252,7 @@ def budget(
         "calibration": miss(calibration, calibration.fixed.ray(pixel) * depth, seen),
         # A wrong depth scales the motion as it scales the distance, so that the angle is right.
         "delay": miss(exact, x_seen + shot.moved * depth / shot.depth, then),
-        "steps": miss(exact, x_then, then, step=reach.step),
+        "steps": miss(exact, x_then, then, step=reach.steps[0]),
         "lens": miss(exact, x_then, then, nominal=shot.nominal_px),
     }
 

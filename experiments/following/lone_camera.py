@@ -229,10 +229,10 @@ class LoneCamera:
             pupil=self._zoom.pupil_at(nominal),
         )
         try:
-            pointing = nearest(ways, limits.pan, limits.tilt, (pan, tilt), self._calibration.zoom_head.axes)
+            pointing = nearest(ways, limits.pan.range, limits.tilt.range, (pan, tilt), self._calibration.zoom_head.axes)
             pan, tilt = float(pointing.pan), float(pointing.tilt)
         except UnreachableError:  # beyond the head's limits: clip
-            pan, tilt = (min(max(q, low), high) for q, (low, high) in ((pan, limits.pan), (tilt, limits.tilt)))
+            pan, tilt = limits.clip(pan, tilt)
         return Sighting(t, pan, tilt, sides, found.clipped), fx
 
     def _follow(self, interval: float) -> None:
@@ -299,13 +299,7 @@ class LoneCamera:
         width, height = self._rig.zoom.size
         steps = math.atan(width / 2 / self._shortest), math.atan(height / 2 / self._shortest)
         limits = self._rig.head.limits
-        return [
-            tuple(  # type: ignore[misc]
-                min(max(q + part * step, low), high)
-                for q, part, step, (low, high) in zip((pan, tilt), parts, steps, (limits.pan, limits.tilt), strict=True)
-            )
-            for parts in RING
-        ]
+        return [limits.clip(pan + across * steps[0], tilt + down * steps[1]) for across, down in RING]
 
 
 def scan_of(rig: Rig, calibration: Calibration) -> list[Angles]:
@@ -321,12 +315,10 @@ def scan_of(rig: Rig, calibration: Calibration) -> list[Angles]:
     axis_base = calibration.zoom_head.T_base_fixed.rotation.apply(edges)
     pans, tilts = np.arctan2(axis_base[:2, 0], axis_base[:2, 2]), np.arctan2(-axis_base[2:, 1], axis_base[2:, 2])
     stops = []
-    for angles, view, (low, high) in zip(
-        (pans, tilts), views, (rig.head.limits.pan, rig.head.limits.tilt), strict=True
-    ):
+    for angles, view, axis in zip((pans, tilts), views, rig.head.limits.axes, strict=True):
         begin, end = float(angles.min()), float(angles.max())
         count = max(1, math.ceil((end - begin) / view))
         middle, step = (begin + end) / 2, (end - begin) / count
-        stops.append([min(max(middle + (i - (count - 1) / 2) * step, low), high) for i in range(count)])
+        stops.append([axis.clip(middle + (i - (count - 1) / 2) * step) for i in range(count)])
     rows = [[(pan, tilt) for pan in stops[0]] for tilt in stops[1]]
     return [pose for i, row in enumerate(rows) for pose in (row[::-1] if i % 2 else row)]

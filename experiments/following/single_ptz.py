@@ -181,7 +181,7 @@ def any_pose(rig: Rig, calibration: Calibration, seed: int) -> tuple[float, floa
     pixel = rng.uniform(0.0, np.array(rig.fixed.size) - 1.0)
     pan, tilt = towards(calibration.zoom_head.T_base_fixed.apply(FAR * calibration.fixed.ray(pixel)))
     limits = rig.head.limits
-    return float(np.clip(pan, *limits.pan)), float(np.clip(tilt, *limits.tilt))
+    return float(np.clip(pan, *limits.pan.range)), float(np.clip(tilt, *limits.tilt.range))
 
 
 def begun(rows: Sequence[Judged]) -> bool:

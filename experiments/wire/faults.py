@@ -167,7 +167,7 @@ def _directions() -> Array:
     calibration = exact_calibration(config)
     path = waypoint_path(config.sim.paths["book"])
     spec = describe(config)
-    reach = Reach(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range)
+    reach = Reach(spec.head.limits.pan.range, spec.head.limits.tilt.range, spec.zoom.focal_range)
     found = []
     for t in np.arange(PERIOD_S / TABLE_S + 1) * TABLE_S:
         x, y, z = path.position(PERIOD_S + t)  # skip the first round, which starts from rest

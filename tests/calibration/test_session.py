@@ -20,9 +20,9 @@ from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig, parse_config
 from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import pose
-from cotarget.rig import PanTiltLimits
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
+from tests.support.rigs import alike
 from tests.support.synthetic_rig import SyntheticRig
 
 BOARD = BoardConfig()
@@ -97,7 +97,7 @@ def test_planned_head_poses_are_within_the_limits(session):
     anywhere = planned(SyntheticRig().limits)
     assert anywhere.shape == (4, 2)
     low, high = anywhere.mean(axis=0) - 0.15, anywhere.mean(axis=0) + 0.15
-    narrow = planned(PanTiltLimits((low[0], high[0]), (low[1], high[1]), 2.6, 3.6, 0.0009))
+    narrow = planned(alike((low[0], high[0]), (low[1], high[1]), 2.6, 3.6, 0.0009))
     assert len(narrow)
     assert ((narrow >= low) & (narrow <= high)).all()
 
@@ -140,7 +140,7 @@ def test_session_writes_its_config_and_commands(tmp_path):
     assert all(a["t"] <= b["t"] for a, b in itertools.pairwise(commands))
 
 
-NARROW = PanTiltLimits((-0.4, 0.4), (-0.4, 0.4), 2.6, 3.6, 0.0009)
+NARROW = alike((-0.4, 0.4), (-0.4, 0.4), 2.6, 3.6, 0.0009)
 
 
 @pytest.mark.parametrize(("broken", "message"), [
@@ -170,7 +170,7 @@ def test_a_head_that_was_halted_on_its_way_is_sent_again(halts):
     rig = SyntheticRig(halts=halts)
     with pytest.raises(CalibrationError, match="the head stands at") if halts > 2 else contextlib.nullcontext():
         CaptureRecorder(rig, BOARD).turn(0.5, 0.1)
-        assert rig.pose == pytest.approx((0.5, 0.1), abs=rig.limits.step)
+        assert rig.pose == pytest.approx((0.5, 0.1), abs=rig.limits.pan.step)
 
 
 class Failing:
@@ -201,7 +201,7 @@ def test_a_move_that_the_watchdog_halted_is_commanded_again(tmp_path, times):
     made = Failing(moves=[HALTED] * times)
     with pytest.raises(HaltedError) if times > 2 else contextlib.nullcontext():
         CaptureRecorder(made.rig, BOARD, tmp_path).turn(0.5, 0.1)
-        assert made.rig.pose == pytest.approx((0.5, 0.1), abs=made.rig.limits.step)
+        assert made.rig.pose == pytest.approx((0.5, 0.1), abs=made.rig.limits.pan.step)
     assert made.sent == [(0.5, 0.1)] * min(times + 1, 3)
     logged = [json.loads(line)["got"] for line in (tmp_path / "commands.jsonl").read_text().splitlines()]
     assert [got is None for got in logged] == [True] * times + [False] * (times < 3)

@@ -120,7 +120,7 @@ def test_predicted_pointing_of_a_scaled_stream_is_the_same(calibration):
 
 
 def test_error_budget_includes_the_calibration(calibration):
-    pixel, reach = np.array([500.0, 100.0]), Reach((-1.5, 1.5), (-1.0, 1.0), (667.0, 7000.0), step=0.001)
+    pixel, reach = np.array([500.0, 100.0]), Reach((-1.5, 1.5), (-1.0, 1.0), (667.0, 7000.0), steps=(0.001, 0.001))
     found = aim(calibration, point_at(calibration, pixel, 8.0), reach, nominal_px=2000.0)
     budget = error_budget(calibration, pixel, found, reach, size_px=40.0)
     assert set(budget) == {"steps", "pixel", "size", "calibration", "total"}

@@ -75,7 +75,7 @@ LIMIT = ("--seconds", "20")
 def test_follow_halts_the_head_then_keeps_the_steps_so_far(folder, capsys, monkeypatch, error, more, status, said):
     error.__dict__.pop("__notes__", None)
     rig = WatchedRig(folder, {("fixed.read", FRAMES + 1): error})
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: rig_of(rig))
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: rig_of(rig))
     ended, out, err = call(capsys, *FOLLOW, *more)
     assert (ended, err) == (status, said)
     if isinstance(error, KeyboardInterrupt):
@@ -98,7 +98,7 @@ def test_ctrl_c_while_a_row_is_written_leaves_table_film_and_count_of_the_same_s
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(CsvFile, "write", interrupted)
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: toy_rig({}))
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: toy_rig({}))
     status, out, err = call(capsys, *FOLLOW)
     assert (status, err) == (0, "")
     assert json.loads(out)["steps"] == rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
@@ -109,7 +109,7 @@ def test_recording_of_a_failed_device_is_replayed_to_its_end(folder, capsys, cap
     """The halts of the recorded run failed too."""
     lost = DeviceError("the line is lost")
     accident = {(failing, FRAMES): lost} | {("head.halt", number): lost for number in range(1, 50)}
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: toy_rig(accident))
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: toy_rig(accident))
     assert call(capsys, *FOLLOW, "--record", "run")[0] == 1
     caplog.clear()
     steps = rows_of(folder / "out.csv")
@@ -122,14 +122,14 @@ def test_recording_of_a_failed_device_is_replayed_to_its_end(folder, capsys, cap
 def test_failed_halt_is_reported_after_ctrl_c(folder, capsys, monkeypatch):
     failing = {("fixed.read", FRAMES): KeyboardInterrupt()}
     failing |= {("head.halt", number): DeviceError("the head is gone") for number in range(1, 50)}
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: toy_rig(failing))
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: toy_rig(failing))
     status, out, err = call(capsys, *FOLLOW)
     assert (status, out) == (1, "")
     assert "the head is gone" in err
 
 
 def test_run_without_a_step_keeps_the_old_table(folder, capsys, monkeypatch):
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: toy_rig({("fixed.read", 1): DeviceError("gone")}))
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: toy_rig({("fixed.read", 1): DeviceError("gone")}))
     assert refused(capsys, *FOLLOW) == "cotarget follow: gone"
     assert (folder / "out.csv").read_text() == OLD
     assert not (folder / "out.mp4").exists()
@@ -159,7 +159,7 @@ def test_follow_reports_why_a_target_was_not_followed(folder, capsys, monkeypatc
     """The bird, 10 to 15 degrees off the axis, is beyond the limits of a head that turns by one degree."""
     with (folder / "rig.toml").open("a") as file:
         file.write("pan_deg = [-1, 1]\n")
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: toy_rig())
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: toy_rig())
     status, out, err = call(capsys, *FOLLOW, "--seconds", "1")
     assert status == 4
     printed = json.loads(out)
@@ -212,7 +212,7 @@ class SlowDevices(ToyDevices):
 def test_skipped_frames_are_counted_and_keep_their_time_in_table_and_film(folder, capsys, monkeypatch, backend):
     if backend == "hardware":
         (folder / "rig.toml").write_text(HARDWARE)
-    monkeypatch.setitem(OPENERS, backend, lambda config, file: rig_of(SlowDevices()))
+    monkeypatch.setitem(OPENERS, backend, lambda *_: rig_of(SlowDevices()))
     status, out, err = call(capsys, *FOLLOW, "--seconds", "3", "--insist")  # no unit's lens is like the toy's
     printed = json.loads(out)
     with (folder / "out.csv").open(newline="") as file:

@@ -62,7 +62,7 @@ def made(tmp_path_factory):
 def folder(made, monkeypatch):
     """The working folder, in which the test must change nothing."""
     monkeypatch.chdir(made)
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: toy_rig())
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: toy_rig())
     before = contents(made)
     yield made
     assert contents(made) == before
@@ -146,7 +146,7 @@ def test_calibration_never_replaces_a_captured_image(folder, capsys, tmp_path, n
 
 
 def test_unwritable_calibration_is_refused_before_the_session(folder, capsys, tmp_path, monkeypatch):
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: pytest.fail("opened"))
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: pytest.fail("opened"))
     out = tmp_path / "c.json"
 
     def refuse(dir):

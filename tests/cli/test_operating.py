@@ -60,6 +60,7 @@ from cotarget.schema import Limits, model
 
 @model
 class Settings(PolledHeadSettings):
+    port: str = ""
     step_deg: float = 0.1
     pan_deg: Limits = (-90.0, 90.0)
     tilt_deg: Limits = (-30.0, 30.0)
@@ -187,7 +188,7 @@ def test_latency_refuses_a_clearly_negative_delay(folder, capsys, monkeypatch, d
     """The default simulation has 60 ms; a sum slightly below zero is zero."""
     found = HeadLatency(Delay(delay, 0.99), command=0.04, frames=100, late="too busy")
     monkeypatch.setattr("cotarget.latency.measure_head", lambda rig: found)
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: rig_of(SimulatedDevices()))
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: rig_of(SimulatedDevices()))
     status, out, err = call(capsys, "latency", "--rig", "sim.toml")
     assert "too busy" in err
     if configured is None:

@@ -98,7 +98,7 @@ def sessions(folder, monkeypatch):
     """Let `calibrate --rig` open a rig without a world, with a replaced session."""
     rig = SimulatedDevices()
     rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, describe(RigConfig()).zoom.focal_range  # 12 x zoom
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: rig_of(rig, config=config))
+    monkeypatch.setitem(OPENERS, "sim", lambda config, *_: rig_of(rig, config=config))
     monkeypatch.setattr("cotarget.cli.calibrate.calibration_summary", lambda found, path: {"verdict": -0.0})
     return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", Session(error))
 
@@ -266,7 +266,7 @@ def pointed(folder, monkeypatch):
         capture=lambda: Frame(image, rig.clock.now()),
         zoom=lambda focal: rig.head.log.append(("zoom", focal)),
     )
-    monkeypatch.setitem(OPENERS, "sim", lambda config, file: rig_of(rig))
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: rig_of(rig))
     return rig
 
 
@@ -289,7 +289,7 @@ def test_point_keeps_the_soft_limits(pointed, capsys, folder):
     assert "-90 to 90" in refused(capsys, "point", "--rig", "rig.toml", "--pan-deg", "91")
     status, out, _ = call(capsys, "point", "--rig", "rig.toml", "--pan-deg", "90.04")  # limits are printed rounded
     assert status == 0
-    assert json.loads(out)["pan_deg"] == pytest.approx(90, abs=math.degrees(pointed.head.limits.step))
+    assert json.loads(out)["pan_deg"] == pytest.approx(90, abs=math.degrees(pointed.head.limits.pan.step))
 
 
 @pytest.mark.parametrize(("wanted", "moved"), [
@@ -303,7 +303,7 @@ def test_point_moves_no_axis_that_is_not_asked_for(pointed, capsys, folder, want
     pointed.head.move(math.radians(100), 0.0, wait=True)
     pointed.head.log.clear()
     (folder / "rig.toml").write_text("[safety]\npan_deg = [-45, 45]\n")
-    step = math.degrees(pointed.head.limits.step)
+    step = math.degrees(pointed.head.limits.pan.step)
     if wanted[:1] == ["--tilt-deg"]:
         assert "cotarget point --pan-deg" in refused(capsys, "point", "--rig", "rig.toml", *wanted)
     else:
@@ -320,7 +320,7 @@ def test_where_says_where_a_stopped_head_stands_and_moves_nothing(pointed, capsy
     status, out, err = call(capsys, "where")
     said = json.loads(out)
     assert (status, err, said["moving"]) == (0, "", False)
-    assert [said["pan_deg"], said["tilt_deg"]] == pytest.approx([30, 0], abs=math.degrees(pointed.head.limits.step))
+    assert [said["pan_deg"], said["tilt_deg"]] == pytest.approx([30, 0], abs=math.degrees(pointed.head.limits.pan.step))
     assert "move" not in [what for what, _ in pointed.head.log]
 
 

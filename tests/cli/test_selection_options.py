@@ -8,11 +8,11 @@ import pytest
 
 from cotarget.cli.pipeline_run import Selection, add_selection
 from cotarget.control.selection import Candidate
-from cotarget.rig import PanTiltLimits
 from cotarget.tracking.track import Track
+from tests.support.rigs import alike
 
 SIZE = (640, 480)
-LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)
+LIMITS = alike((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)
 
 
 def chosen(*arguments, recorded=None):

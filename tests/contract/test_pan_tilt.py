@@ -15,14 +15,14 @@ FAR = 0.4  # rad
 
 def limits_are_ascending_and_positive(head, clock):
     limits = head.limits
-    assert limits.pan[0] < limits.pan[1]
-    assert limits.tilt[0] < limits.tilt[1]
-    assert min(limits.speed, limits.acceleration) > 0
-    assert limits.step >= 0
+    assert limits.pan.range[0] < limits.pan.range[1]
+    assert limits.tilt.range[0] < limits.tilt.range[1]
+    assert min(limits.pan.speed, limits.pan.acceleration) > 0
+    assert limits.pan.step >= 0
 
 
 def move_returns_what_is_commanded_after_rounding_to_steps(head, clock):
-    step = head.limits.step
+    step = head.limits.pan.step
     pan, tilt = head.move(40.4 * step, -20.6 * step)
     assert (pan, tilt) == (pytest.approx(40 * step, abs=ROUNDING), pytest.approx(-21 * step, abs=ROUNDING))
 
@@ -32,8 +32,8 @@ def move_returns_what_is_commanded_after_clipping_to_the_limits(head, clock):
     for sign, end in ((-9, 0), (9, 1)):
         commanded = head.move(sign, sign)
         assert limits.allow(*(angle * (1 - ROUNDING) for angle in commanded))
-        for angle, ends in zip(commanded, (limits.pan, limits.tilt), strict=True):
-            assert angle == pytest.approx(ends[end], abs=limits.step)
+        for angle, ends in zip(commanded, (limits.pan.range, limits.tilt.range), strict=True):
+            assert angle == pytest.approx(ends[end], abs=limits.pan.step)
 
 
 def move_returns_at_once_and_the_head_moves_until_it_stands_there(head, clock):
@@ -59,7 +59,7 @@ def no_axis_is_faster_than_commanded(head, clock):
         head.move(0.0, 0.0, wait=True)
         begin = clock.now()
         head.move(FAR, FAR / 2, speed=speed, wait=True)
-        assert clock.now() - begin >= FAR / SLOW - head.limits.step / SLOW
+        assert clock.now() - begin >= FAR / SLOW - head.limits.pan.step / SLOW
 
 
 def the_newest_command_wins(head, clock):

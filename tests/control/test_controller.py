@@ -16,18 +16,18 @@ from cotarget.control.zoom import ZoomSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Appearance
 from cotarget.geometry import pose
-from cotarget.rig import PanTiltLimits, PanTiltState, ZoomState
+from cotarget.rig import PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.motion import Axis
 from cotarget.targeting import WantedSize
-from tests.support.rigs import rig_of
+from tests.support.rigs import alike, rig_of
 
 SIZE, CENTER = (640, 480), (319.5, 239.5)
 SHORTEST, LONGEST = 700.0, 7000.0
 CLEARLY = 1.02  # times as large, where rounding makes 1e-6
 TRUE = 1.1  # what the lens magnifies over what its device tells
 BOOK = DEFAULT_TARGETS["book"]
-LIMITS = PanTiltLimits((-1.0, 1.0), (-0.8, 0.5), math.radians(149), math.radians(206), 0.0)
+LIMITS = alike((-1.0, 1.0), (-0.8, 0.5), math.radians(149), math.radians(206), 0.0)
 DELAY, FRAME = 0.1, 0.04
 HERE = pose([0, 0, 0], [0, 0, 0])
 CALIBRATION = Calibration(
@@ -60,7 +60,7 @@ class Rig:
         )
         self.zoom.zoom = self._zoom
 
-        self.axes = [Axis(LIMITS.speed, LIMITS.acceleration) for _ in range(2)]
+        self.axes = [Axis(LIMITS.pan.speed, LIMITS.pan.acceleration) for _ in range(2)]
         for pan, tilt, _ in self.moves:  # those of before
             self._go(pan, tilt, -10.0)
 
@@ -165,7 +165,7 @@ def test_the_bias_of_the_head_is_taken_off_within_its_limits():
     assert found.pan == pytest.approx(math.atan(0.2) - 0.01)
     assert found.tilt == pytest.approx(math.atan(1 / math.hypot(2, 10)) + 0.02)
     edge = 10 * math.tan(0.999)
-    assert controller(Rig()).drive(still(edge, bias=(-0.01, 0.0)), 0.0, FRAME)[0].pan == LIMITS.pan[1]
+    assert controller(Rig()).drive(still(edge, bias=(-0.01, 0.0)), 0.0, FRAME)[0].pan == LIMITS.pan.range[1]
 
 
 @pytest.mark.parametrize(
@@ -294,5 +294,5 @@ def test_what_can_be_reached():
 def test_the_reach_of_a_rig_is_that_of_its_devices():
     rig = Rig(moves=[(0.2, 0.1, None)])
     reach = reach_of(rig)
-    assert (reach.pan, reach.tilt, reach.focal_px) == (LIMITS.pan, LIMITS.tilt, (SHORTEST, LONGEST))
-    assert (reach.now, reach.step) == ((0.2, 0.1), 0.0)
+    assert (reach.pan, reach.tilt, reach.focal_px) == (LIMITS.pan.range, LIMITS.tilt.range, (SHORTEST, LONGEST))
+    assert (reach.now, reach.steps) == ((0.2, 0.1), (0.0, 0.0))

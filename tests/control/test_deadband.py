@@ -1,21 +1,22 @@
 """The dead zone on the simulated unit's own axes: how often it is commanded, and how far off the target stands."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
 from cotarget.control.head import HeadController, HeadSettings
 from cotarget.estimation import TargetFilter
-from cotarget.rig import PanTiltLimits, PanTiltState
+from cotarget.rig import PanTiltState
 from cotarget.sim.motion import Axis
 from cotarget.targeting import Reach, aim
 from experiments.calibration.synthetic.rig import SIZE
 from tests.support.moving_targets import RATE, Flight, show
+from tests.support.rigs import alike, with_axes
 
 STEP = math.radians(0.0514286)
-LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), STEP)
+LIMITS = alike((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), STEP)
 LATENCY, DELAY = 0.12, 0.08  # from light to frame, and from command to motion [s]
 SECONDS = 8.0
 EXPOSURE = 0.01  # [s]
@@ -37,7 +38,7 @@ class Result:
 class Head:
     """The simulated unit's two axes behind their command delay, and what was asked of them."""
 
-    axes: tuple = field(default_factory=lambda: tuple(Axis(LIMITS.speed, LIMITS.acceleration) for _ in range(2)))
+    axes: tuple = field(default_factory=lambda: tuple(Axis(axis.speed, axis.acceleration) for axis in LIMITS.axes))
     goals: list = field(default_factory=list)
 
     def move(self, t, pan, tilt, speed):
@@ -79,13 +80,13 @@ def follow(name, seed, settings):
         estimates = [estimator.estimate(s) for s in (effect, effect + 1 / RATE)]
         if estimates[0] is None:
             continue
-        reach = Reach(LIMITS.pan, LIMITS.tilt, (667.0, 8000.0), head.at(t), STEP)
+        reach = Reach(LIMITS.pan.range, LIMITS.tilt.range, (667.0, 8000.0), head.at(t), STEP)
         aims = [aim(flight.calibration, e.x_fixed, reach, nominal_px=NOMINAL[name]) for e in estimates]
         (wanted, after) = ((a.pan - e.bias[0], a.tilt - e.bias[1]) for a, e in zip(aims, estimates, strict=True))
         rates = tuple((b - a) * RATE for a, b in zip(wanted, after, strict=True))
         if head_controller is None:
             # The unit brakes to rest at its goal, which therefore lies its stopping distance ahead.
-            goals = [q + r * abs(r) / (2 * LIMITS.acceleration) for q, r in zip(after, rates, strict=True)]
+            goals = [q + r * abs(r) / (2 * LIMITS.pan.acceleration) for q, r in zip(after, rates, strict=True)]
             head.move(t, *goals, None)
         else:
             head_controller.head.add_report(PanTiltState(*head.at(t), True, t))
@@ -182,7 +183,7 @@ def test_a_target_that_stands_is_centred_once_and_left_alone():
 
 
 def test_a_servo_that_rests_off_its_goal_is_left_alone_too():
-    head_controller = standing(replace(LIMITS, slack=4 * STEP))
+    head_controller = standing(with_axes(LIMITS, slack=4 * STEP))
     decide(head_controller, 0.0, 0.05)
     for i in range(25, 100):
         head_controller.head.add_report(PanTiltState(0.05 + (4 - i % 2) * STEP, 0.0, False, i * FRAME))  # it trembles
@@ -206,7 +207,7 @@ def test_a_moving_target_is_followed_at_its_own_speed():
     for t, command in late:
         assert command.speed[0] == pytest.approx(rate, rel=0.1)
         # The goal is that far ahead, and the way on which the unit brakes farther.
-        ahead = 0.5 + rate * (t + ahead_s) + rate**2 / (2 * LIMITS.acceleration)
+        ahead = 0.5 + rate * (t + ahead_s) + rate**2 / (2 * LIMITS.pan.acceleration)
         assert command.pan == pytest.approx(ahead, abs=1.5 * ZONE)
 
 
@@ -241,12 +242,12 @@ def test_an_axis_that_stands_is_left_alone_while_the_other_turns():
 
 def test_a_goal_is_within_the_limits():
     command = decide(standing(pan=2.7), 0.0, 2.75, 0.5)
-    assert command.pan == LIMITS.pan[1]
+    assert command.pan == LIMITS.pan.range[1]
 
 
 def test_a_head_that_jumps_is_sent_to_the_middle_of_the_way():
     """The textbook's unit, without limits of speed and acceleration."""
-    limits = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.inf, math.inf, 0.0)
+    limits = alike((-2.8, 2.8), (-0.8, 0.5), math.inf, math.inf, 0.0)
     head_controller = standing(limits)
     command = decide(head_controller, 0.0, 0.5, 0.4)
     assert (command.pan, command.speed) == (0.5 + 0.4 * FRAME / 2, None)

@@ -24,10 +24,10 @@ from cotarget.control.selection import (
     selector_table,
     travel_s,
 )
-from cotarget.rig import PanTiltLimits
 from cotarget.tracking.track import Track
+from tests.support.rigs import alike, with_axes
 
-LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), math.radians(0.0514286))
+LIMITS = alike((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), math.radians(0.0514286))
 STILL = np.zeros(2)
 LOOK_S, SETTLE_S = Rounds.look_s, Rounds.settle_s
 nearest_deadline, most_served = POLICIES["nearest-deadline"], POLICIES["most-served"]
@@ -47,9 +47,9 @@ def test_a_way_takes_as_long_as_the_units_profile_says():
     assert travel_s(np.radians([20.0, 5.0]), LIMITS) == pytest.approx(2 * math.sqrt(20 / 206))
     assert travel_s(np.radians([0.0, -140.0]), LIMITS) == pytest.approx(2 * 149 / 206 + (140 - 149**2 / 206) / 149)
     assert travel_s(STILL, LIMITS) == 0.0
-    at_once = replace(LIMITS, acceleration=math.inf)
-    assert travel_s((0.0, at_once.speed), at_once) == pytest.approx(1.0)
-    assert travel_s(STILL, at_once) == travel_s(STILL, replace(at_once, speed=math.inf)) == 0.0
+    at_once = with_axes(LIMITS, acceleration=math.inf)
+    assert travel_s((0.0, at_once.pan.speed), at_once) == pytest.approx(1.0)
+    assert travel_s(STILL, at_once) == travel_s(STILL, with_axes(at_once, speed=math.inf)) == 0.0
 
 
 def test_when_a_track_leaves_the_image():

@@ -14,13 +14,13 @@ from cotarget.drivers import rig as rig_module
 from cotarget.drivers.axis import AxisSettings
 from cotarget.drivers.board import BoardSettings
 from cotarget.drivers.gphoto_camera import GphotoSettings
-from cotarget.drivers.interlock import rig_lock
+from cotarget.drivers.interlock import addresses_of, rig_lock
 from cotarget.drivers.link_errors import InUseError
 from cotarget.drivers.ptu_d46 import D46Settings
 from cotarget.drivers.rig import device_of, open_hardware
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.plugins import load
-from cotarget.rig import PanTiltLimits
+from tests.support.rigs import alike
 
 ORDER = ("board", "fixed", "zoom", "head")
 CONFIG = parse_config(
@@ -35,7 +35,7 @@ CONFIG = parse_config(
 )
 
 
-LIMITS = PanTiltLimits((-2.0, 2.0), (-0.5, 0.5), 2.0, 3.0, 0.001)
+LIMITS = alike((-2.0, 2.0), (-0.5, 0.5), 2.0, 3.0, 0.001)
 
 
 @pytest.fixture
@@ -102,6 +102,22 @@ def test_the_head_is_opened_last_and_closed_first(devices):
     assert len(log) == len(ORDER)
 
 
+@pytest.mark.parametrize("there", ["fixed", "zoom", "head"])
+def test_one_device_may_be_opened_alone(devices, there):
+    log, *_ = devices
+    config = parse_config({"backend": "hardware", "hardware": {there: getattr(CONFIG.hardware, there)}})
+    with pytest.raises(ConfigError, match="is missing"):
+        open_rig(config, guarded=False)
+    with open_rig(config, guarded=False, partial=True) as rig:
+        assert [entry for entry in log if "board" not in entry] == [f"open {there}"]
+        assert rig.missing == {"fixed", "zoom", "head"} - {there}
+        for role, call in {"fixed": "read", "zoom": "state", "head": "state"}.items():
+            if role in rig.missing:
+                with pytest.raises(ConfigError, match=rf"^hardware\.{role}\."):
+                    getattr(getattr(rig, role), call)()
+        rig.head.halt() if there != "head" else None
+
+
 def test_opening_shortens_the_thread_switch_interval(devices):
     before = sys.getswitchinterval()
     sys.setswitchinterval(5e-3)  # Python's default
@@ -162,7 +178,7 @@ def test_a_rig_in_use_is_refused_before_a_device_is_opened(devices, port, tmp_pa
 
 OWN_HEAD = """
 import dataclasses
-from cotarget.rig import HeadSpec, PanTiltLimits
+from cotarget.rig import AxisLimits, HeadSpec, PanTiltLimits
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -170,7 +186,7 @@ class Settings:
     port: int = 0
     dome_url: str = ""
     at: str = ""
-    spec = HeadSpec(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), 1.0, 1.0, 0.0), 0.0)
+    spec = HeadSpec(PanTiltLimits(*[AxisLimits((-1.0, 1.0), 1.0)] * 2), 0.0)
 
 class Head:
     def probe(settings):
@@ -193,7 +209,7 @@ def test_a_head_of_ones_own_is_locked_by_its_address_whatever_the_key(tmp_path, 
     (tmp_path / "own.py").write_text(OWN_HEAD)
     driver = {"driver": f"{tmp_path}/own.py:Head"}
     first, second = (device_of("head", driver | each) for each in (table, other))
-    with rig_lock(*first.addresses):
+    with rig_lock(*addresses_of(first.settings)):
         with pytest.raises(InUseError):
             second.probe()
         assert device_of("head", driver | {"host": "192.0.2.1", "port": 4002}).probe() == "asked"

@@ -8,19 +8,30 @@ from dataclasses import replace
 import pytest
 
 from cotarget.config import SafetyConfig
+from cotarget.drivers.axes import AxisFacts, Poll
 from cotarget.drivers.interlock import PositionLostMarker
+from cotarget.drivers.lens import LensPositions
 from cotarget.drivers.link_errors import CutError, LostError, PositionLostError, RefusedError, SilentError
-from cotarget.drivers.polled_head import AxisFacts, HeadLink, Poll, PolledHead, PolledHeadSettings
+from cotarget.drivers.polled_head import HeadLink, Loop, Move, PolledHead, PolledHeadSettings, Requests
 from cotarget.errors import ConfigError, DeviceError, HaltedError
+from cotarget.schema import model
 from tests.support.emulated_camera import DEADLINE_S
 from tests.support.plants import fails, wait_for
 from tests.support.simulated_clock import SimClock
 
 STEP = math.radians(0.1)
-FACTS = AxisFacts(STEP, -900, 900, slowest=10, fastest=500, acceleration=1000, still_s=0.11)
-SETTINGS = {"port": "COUNTER", "step_deg": 0.1, "pan_deg": (-90, 90), "tilt_deg": (-90, 90), "tilt_sign": -1}
+STEPPER = {"step": 1, "slowest": 10, "fastest": 500, "acceleration": 1000, "still_s": 0.11, "loses_steps": True}
+FACTS = AxisFacts(unit=STEP, lowest=-900, highest=900, **STEPPER)
+SETTINGS = {"address": "COUNTER", "step_deg": 0.1, "pan_deg": (-90, 90), "tilt_deg": (-90, 90), "tilt_sign": -1}
 SETTINGS |= {"speed_deg_s": 40.0, "command_delay_s": 0.0}
 EXCHANGE_S = 0.01
+
+
+@model
+class Settings(PolledHeadSettings):
+    """A polled head at an address."""
+
+    address: str = ""
 
 
 class CounterLink(HeadLink):
@@ -30,14 +41,15 @@ class CounterLink(HeadLink):
     axes = (FACTS, FACTS)
 
     def __init__(self, clock):
-        self.clock, self.hurry = clock, lambda: False
+        self.clock, self.requests = clock, Requests()
         self.at, self.sent = [0, 0], []
         self.fails = []  # errors of the next moves
         self.polls_fail = []  # errors of the next polls; the last one for ever before an Ellipsis
         self.stuck = self.restless = False
         self.meanwhile = lambda: None  # called once after the next move was sent, before a poll
 
-    def poll(self):
+    def poll(self, requests):
+        self.requests = requests
         self.clock.sleep_until(self.clock.now() + EXCHANGE_S)
         if self.sent:
             act, self.meanwhile = self.meanwhile, lambda: None
@@ -52,8 +64,7 @@ class CounterLink(HeadLink):
             self.at[0] += 1
         return [Poll(axis, position, self.clock.now()) for axis, position in enumerate(self.at)]
 
-    def move(self, goals, speeds, proceed):
-        proceed()
+    def move(self, goals, speeds, requests):
         self.clock.sleep_until(self.clock.now() + EXCHANGE_S)
         self.sent.append((goals, speeds))
         if self.fails:
@@ -70,9 +81,6 @@ class CounterLink(HeadLink):
     def send_halt(self):
         self.sent.append("halt without an answer")
 
-    def check(self):
-        pass
-
     def close(self):
         self.sent.append("closed")
 
@@ -88,7 +96,7 @@ def opened(link, tmp_path, monkeypatch):
     heads = []
 
     def open_head(safety=None, **settings):
-        config = PolledHeadSettings(**{**SETTINGS, **settings})
+        config = Settings(**{**SETTINGS, **settings})
         safety = SafetyConfig(**{"stop_file": tmp_path / "stop", **(safety or {})})
         heads.append(PolledHead(lambda: link, config, link.clock, safety))
         return heads[-1]
@@ -101,7 +109,7 @@ def opened(link, tmp_path, monkeypatch):
 
 def test_it_moves_in_its_units_with_its_signs(opened, link):
     head = opened()
-    assert math.degrees(head.limits.speed) == pytest.approx(40.0)
+    assert math.degrees(head.limits.pan.speed) == pytest.approx(40.0)
     pan, tilt = head.move(math.radians(10.04), math.radians(-120.0), wait=True)
     assert (math.degrees(pan), math.degrees(tilt)) == (pytest.approx(10.0), pytest.approx(-90.0))
     assert head.state().tilt == tilt
@@ -109,19 +117,20 @@ def test_it_moves_in_its_units_with_its_signs(opened, link):
     assert link.sent == [((100, 900), (400, 400)), ((0, 0), (100, 200))]
 
 
-@pytest.mark.parametrize(("asked", "sent"), [(None, 400), (100.6 * STEP, 100), (58 * STEP, 58), (1e-9, 10), (1e9, 400)])
-def test_speeds_are_whole_steps_within_the_units_and_the_files_bounds(opened, link, asked, sent):
+@pytest.mark.parametrize(("asked", "sent"), [(None, 400), (58.5 * STEP, 58.5), (1e-9, 10), (1e9, 400)])
+def test_speeds_are_within_the_units_and_the_files_bounds(opened, link, asked, sent):
     opened().move(STEP, STEP, speed=asked, wait=True)
-    assert link.sent == [((1, -1), (sent, sent))]
+    assert link.sent == [((1, -1), pytest.approx((sent, sent)))]
 
 
-def test_limits_and_braking_are_those_of_the_weaker_axis(opened, link):
+def test_each_axis_has_its_limits_and_the_slower_one_to_brake_is_waited_for(opened, link):
     """Tilt turns at 30 degrees/s, where 40 are configured, and brakes from that in 3 s."""
     link.axes = (FACTS, replace(FACTS, fastest=300, acceleration=100))
     patience = []
     link.halt = patience.append
     head = opened()
-    assert (head.limits.speed, head.limits.acceleration) == (pytest.approx(300 * STEP), pytest.approx(100 * STEP))
+    assert [axis.speed for axis in head.limits.axes] == pytest.approx([400 * STEP, 300 * STEP])
+    assert [axis.acceleration for axis in head.limits.axes] == pytest.approx([1000 * STEP, 100 * STEP])
     head.halt()
     assert patience[0] >= 3.0
 
@@ -139,7 +148,7 @@ def test_closing_sends_a_last_halt_before_the_port_is_closed(opened, link):
 
 def test_closing_raises_in_a_move_that_waits(opened, link):
     head, said = opened(), []
-    link.stuck, link.meanwhile = True, lambda: wait_for(link.hurry)
+    link.stuck, link.meanwhile = True, lambda: wait_for(link.requests.halt_waits)
     thread = threading.Thread(target=lambda: said.append(fails(lambda: head.move(STEP, 0.0, wait=True))))
     thread.start()
     wait_for(lambda: link.sent)
@@ -240,7 +249,7 @@ def test_a_lost_position_is_remembered_until_the_unit_was_reset(opened, link, tm
     assert file.read_text() == f"{said}\n"
     link.sent.clear()
     for port in ("COUNTER", "ANOTHER"):  # as an adapter that was replugged may have
-        again = fails(lambda port=port: opened(safety, port=port))
+        again = fails(lambda port=port: opened(safety, address=port))
         assert again.startswith(said)
         assert str(file) in again
     assert link.sent == []
@@ -258,21 +267,21 @@ class ServoLink(CounterLink):
     axes = (SERVO, SERVO)
     off = 2
 
-    def poll(self):
-        polls = super().poll()
+    def poll(self, requests):
+        polls = super().poll(requests)
         tremble = round(self.clock.now() / EXCHANGE_S) % 2
         return [poll._replace(position=poll.position + self.off + tremble) for poll in polls]
 
 
 def test_a_servo_arrives_within_its_slack_and_never_loses_its_position(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    link, settings = ServoLink(SimClock()), PolledHeadSettings(**SETTINGS)
+    link, settings = ServoLink(SimClock()), Settings(**SETTINGS)
     head = PolledHead(lambda: link, settings, link.clock)
     for goal in (10 * STEP, 0.0):
         head.move(goal, 0.0, wait=True)
         assert not head.state().moving
         assert head.state().pan == pytest.approx(goal + 2.5 * STEP, abs=0.6 * STEP)
-    assert head.limits.slack == pytest.approx(3 * STEP)
+    assert head.limits.pan.slack == pytest.approx(3 * STEP)
     link.stuck = True  # something is in its way
     said = fails(lambda: head.move(500 * STEP, 0.0, wait=True))
     assert "did not arrive in time" in said
@@ -289,8 +298,8 @@ def test_a_servo_arrives_within_its_slack_and_never_loses_its_position(tmp_path,
 class SaggingLink(ServoLink):
     """A servo that sags by two steps wherever it is sent, and tells its goal."""
 
-    def poll(self):
-        return [poll._replace(position=poll.position + self.off) for poll in CounterLink.poll(self)]
+    def poll(self, requests):
+        return [poll._replace(position=poll.position + self.off) for poll in CounterLink.poll(self, requests)]
 
     def goals(self):
         return tuple(self.at)
@@ -299,7 +308,7 @@ class SaggingLink(ServoLink):
 def test_an_axis_that_is_sent_to_where_it_stands_keeps_its_goal(tmp_path, monkeypatch):
     """As `point` does with an axis that is not asked for, from one program to the next."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    link, settings = SaggingLink(SimClock()), PolledHeadSettings(**SETTINGS)
+    link, settings = SaggingLink(SimClock()), Settings(**SETTINGS)
     link.at = [10, 0]
     for pan in (20, 30):
         head = PolledHead(lambda: link, settings, link.clock)
@@ -310,14 +319,167 @@ def test_an_axis_that_is_sent_to_where_it_stands_keeps_its_goal(tmp_path, monkey
 
 def test_axes_of_two_scales(opened, link):
     """Advice that is followed is right."""
-    link.axes = (FACTS, replace(FACTS, step=STEP / 2, lowest=-1800, highest=1800, fastest=2000))
+    link.axes = (FACTS, replace(FACTS, unit=STEP / 2, lowest=-1800, highest=1800, fastest=2000))
     with pytest.raises(ConfigError, match=r"^hardware\.head\.step_deg: .* write step_deg = \[0\.1, 0\.05\]"):
         opened()
     link.sent.clear()
     head = opened(step_deg=(0.1, 0.05))
-    assert (head.limits.step, head.limits.tilt) == (pytest.approx(STEP), pytest.approx((-math.pi / 2, math.pi / 2)))
+    assert [axis.step for axis in head.limits.axes] == pytest.approx([STEP, STEP / 2])
     head.move(10 * STEP, 10.5 * STEP, wait=True)
     assert link.sent == [((10, -21), (400, 800))]
+
+
+# Units that are no steppers
+
+DEGREES = AxisFacts(
+    unit=math.radians(1.0), lowest=-90.0, highest=90.0, fastest=60.0, step=0.0, slack=0.2, loses_steps=False
+)
+LENS = AxisFacts(unit=1.0, lowest=0.0, highest=1000.0, fastest=800.0, step=1.0, loses_steps=False)
+RATES = (30.0, 20.0, 800.0)  # [degrees/s, degrees/s, 1/s]
+SIGMA = 0.1  # [degrees]
+
+
+class Turret(HeadLink):
+    """Continuous pan and tilt in degrees, and a lens of 0 to 1000, which turn while polls pass the time."""
+
+    name, axes = "TURRET", (DEGREES, DEGREES, LENS)
+    says = False  # whether it says that it moves
+
+    def __init__(self, clock):
+        self.clock, self.sent = clock, []
+        self.at, self.goal = [0.0] * 3, [0.0] * 3
+
+    def poll(self, requests):
+        self.clock.sleep_until(self.clock.now() + EXCHANGE_S)
+        self.turn()
+        moving = [at != goal if self.says else None for at, goal in zip(self.at, self.goal, strict=True)]
+        return [Poll(i, at, self.clock.now(), moving[i], SIGMA) for i, at in enumerate(self.at)]
+
+    def turn(self):
+        for i, (at, goal, rate) in enumerate(zip(self.at, self.goal, RATES, strict=True)):
+            way = goal - at
+            self.at[i] = goal if abs(way) <= rate * EXCHANGE_S else at + math.copysign(rate * EXCHANGE_S, way)
+
+    def move(self, goals, speeds, requests):
+        self.sent.append(goals)
+        self.goal[:2] = goals
+
+    def zoom(self, position, requests):
+        self.goal[2] = position
+
+    def halt(self, patience):
+        self.sent.append(patience)
+        self.goal[:2] = self.at[:2]
+
+    def close(self):
+        pass
+
+
+class VelocityTurret(Turret):
+    """A turret that takes velocities, each for `LASTS_S`."""
+
+    LASTS_S, GAIN = 0.05, 10.0
+    rates, until = (0.0, 0.0), 0.0
+
+    def turn(self):
+        if self.clock.now() < self.until:
+            self.at[:2] = [at + rate * EXCHANGE_S for at, rate in zip(self.at[:2], self.rates, strict=True)]
+
+    def move(self, goals, speeds, requests):
+        self.wanted = goals
+        self.renew(requests)
+
+    def renew(self, requests):
+        self.rates = tuple(
+            max(-rate, min(rate, self.GAIN * (goal - at)))
+            for goal, at, rate in zip(self.wanted, self.at, RATES, strict=False)
+        )
+        self.until = self.clock.now() + self.LASTS_S
+        self.sent.append(self.rates)
+
+    def halt(self, patience):
+        super().halt(patience)
+        self.rates = (0.0, 0.0)
+
+
+@pytest.fixture
+def turret(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    heads = []
+
+    def open_head(kind=Turret, **changes):
+        link = kind(SimClock())
+        vars(link).update(changes)
+        heads.append(PolledHead(lambda: link, Settings(**{**SETTINGS, "step_deg": 0.0, "tilt_sign": 1}), link.clock))
+        return heads[-1], link
+
+    yield open_head
+    for head in heads:
+        head.close()
+
+
+@pytest.mark.parametrize("kind", [Turret, VelocityTurret])
+def test_a_continuous_head_arrives_within_its_slack(turret, kind):
+    head, _ = turret(kind)
+    assert (head.limits.pan.step, head.limits.pan.acceleration) == (0.0, None)
+    wanted = math.radians(10.37), math.radians(-5.2)
+    assert head.move(*wanted, wait=True) == pytest.approx(wanted)
+    state = head.state()
+    assert (state.pan, state.tilt) == pytest.approx(wanted, abs=math.radians(0.2))
+    assert (state.moving, state.sigma) == (False, pytest.approx(math.radians(SIGMA)))
+
+
+def test_velocities_are_renewed_until_the_head_arrives_or_is_halted(turret):
+    head, link = turret(VelocityTurret)
+    head.move(math.radians(60.0), 0.0, wait=True)
+    assert len(link.sent) > 60.0 / RATES[0] / VelocityTurret.LASTS_S  # each would have ended after that time
+    link.sent.clear()
+    head.move(math.radians(-60.0), 0.0)
+    wait_for(lambda: link.at[0] < 50.0)
+    head.halt()
+    after = link.sent[-1]
+    begin = link.clock.now()
+    wait_for(lambda: link.clock.now() > begin + 1.0)
+    assert link.sent[-1] == after > 0.0  # the halt's patience, and no velocity since
+
+
+@pytest.mark.parametrize(("says", "delay_s"), [(True, 0.0), (False, DEGREES.still_s)])
+def test_a_head_that_says_whether_it_moves_is_believed(says, delay_s):
+    link = Turret(SimClock())
+    link.says = says
+    loop, move = Loop(link, link.clock, 0.0), Move(1, (30.0, 0.0), (60.0, 60.0))
+    loop.requests.add(loop.requests.moves, move)
+    begin = link.clock.now()
+    while not move.done.is_set():
+        loop.turn()
+    assert link.clock.now() - begin == pytest.approx(30.0 / RATES[0] + delay_s, abs=2 * EXCHANGE_S)
+
+
+def test_the_lens_may_be_a_third_axis(turret):
+    head, link = turret()
+    lens = head.lens(LensPositions(((0, 100.0), (1000, 1000.0)), range(1001)))
+    assert lens.focal_range == pytest.approx((100.0, 1000.0))
+    head.move(math.radians(30.0), 0.0)
+    lens.zoom(900.0)
+    said = lens.zoom(100.0 * 10**0.8)
+    assert (said, lens.state().moving) == (pytest.approx(100.0 * 10**0.8), True)
+    wait_for(lambda: not lens.state().moving)
+    assert (lens.state().focal_px, link.goal[2]) == (pytest.approx(said), 800)
+    head.move(0.0, 0.0)
+    lens.zoom(100.0)
+    head.halt()  # stops pan and tilt
+    wait_for(lambda: not lens.state().moving)
+    assert lens.state().focal_px == pytest.approx(100.0)
+
+
+def test_a_pause_between_polls_holds_up_no_request(turret):
+    head, link = turret()
+    link.pause_s = DEADLINE_S
+    head.move(math.radians(80.0), 0.0)
+    head.halt()
+    assert link.sent[-1] >= 1.0  # the halt's patience covers the time that domes were seen to turn on
+    head.close()
+    assert not any(thread.name.startswith("head at") for thread in threading.enumerate())
 
 
 # Halts
@@ -325,7 +487,7 @@ def test_axes_of_two_scales(opened, link):
 
 def test_halts_from_many_threads(opened, link):
     head = opened()
-    link.stuck, link.meanwhile = True, lambda: wait_for(link.hurry)
+    link.stuck, link.meanwhile = True, lambda: wait_for(link.requests.halt_waits)
     head.move(STEP, 0.0)
     threads = [threading.Thread(target=head.halt) for _ in range(5)]
     for thread in threads:
@@ -345,7 +507,7 @@ def test_a_signal_handler_may_halt_whatever_it_interrupts(opened, link):
 
     def interrupt():
         signal.pthread_kill(threading.main_thread().ident, signal.SIGUSR1)
-        wait_for(link.hurry)
+        wait_for(link.requests.halt_waits)
 
     link.stuck, link.meanwhile = True, interrupt
     before = signal.signal(signal.SIGUSR1, handler)
@@ -366,7 +528,7 @@ def test_a_halted_move_may_be_commanded_again(opened, link):
 
     def halt():
         halts.start()
-        wait_for(link.hurry)
+        wait_for(link.requests.halt_waits)
 
     link.stuck, link.meanwhile = True, halt
     with pytest.raises(HaltedError):
@@ -393,10 +555,10 @@ def test_a_link_that_hangs_holds_up_neither_a_halt_nor_the_end(opened, link, mon
         monkeypatch.setattr(f"cotarget.drivers.polled_head.{limit}", 0.01)
     hangs, release = threading.Event(), threading.Event()
 
-    def poll():
+    def poll(requests):
         hangs.set()
         release.wait(DEADLINE_S)
-        return CounterLink.poll(link)
+        return CounterLink.poll(link, requests)
 
     head = opened()
     link.poll = poll
@@ -437,5 +599,5 @@ def test_a_link_without_a_required_part_is_refused_and_closed(link, missing):
             return getattr(link, name)
 
     with pytest.raises(ConfigError, match=f"^hardware.head.driver: Lacking has no {missing}"):
-        PolledHead(Lacking, PolledHeadSettings(**SETTINGS), link.clock)
+        PolledHead(Lacking, Settings(**SETTINGS), link.clock)
     assert link.sent == ([] if missing == "close" else ["closed"])

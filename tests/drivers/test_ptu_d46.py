@@ -89,7 +89,7 @@ def test_a_unit_is_identified_in_any_manner(echo, verbose):
     assert (facts.version, facts.mode) == (VERSION, "H")
     assert facts.limits == (-3090, 3090, -907, 604)
     assert (facts.pan.slowest, facts.pan.fastest, facts.pan.acceleration) == (31, 2902, 2000)
-    assert math.degrees(facts.pan.step) * 3600 == pytest.approx(185.1428, rel=1e-12)
+    assert math.degrees(facts.pan.unit) * 3600 == pytest.approx(185.1428, rel=1e-12)
     assert (bench.unit.echo, bench.unit.verbose) == (False, False)
     assert set(bench.unit.heard) <= HARMLESS
     assert bench.unit.goals() == (0, 0)
@@ -100,7 +100,7 @@ def test_a_leading_line_feed_and_what_was_left_in_the_line_do_no_harm(bench):
     answer = bench.unit.answer
     bench.unit.answer = lambda order: b"\n" + answer(order)
     bench.start()
-    assert bench.loop.snapshot.pan == 0
+    assert bench.loop.snapshot.positions[0] == 0
 
 
 def test_velocity_mode_is_left_and_old_firmware_has_no_modes(bench):
@@ -220,7 +220,7 @@ def test_a_position_is_dated_in_the_middle_of_the_units_pause(bench):
     """Between the command's last byte and the answer's first, which comes 20 ms later."""
     bench.start()
     bench.port.latency = 0.02
-    (poll,) = bench.link.poll()
+    (poll,) = bench.link.poll(bench.loop.requests)
     sent, order = bench.port.sent[-1]
     assert poll.t == pytest.approx(sent + len(order) * BYTE + 0.01, abs=BYTE / 10)
 
@@ -233,8 +233,8 @@ def test_a_snapshot_has_both_axes_at_one_time(bench):
     for _ in range(30):
         bench.loop.turn()
         seen = bench.loop.snapshot
-        assert seen.pan == pytest.approx((seen.t - pan) * 1000, abs=1.5)  # a step of rounding, and half of one
-        assert seen.tilt == pytest.approx((tilt - seen.t) * 1000, abs=1.5)
+        assert seen.positions[0] == pytest.approx((seen.t - pan) * 1000, abs=1.5)  # a step of rounding, and half of one
+        assert seen.positions[1] == pytest.approx((tilt - seen.t) * 1000, abs=1.5)
 
 
 # Moves
@@ -264,7 +264,7 @@ def test_it_moves_from_the_command_until_it_stands_there(bench, delay):
     assert move.error is None
     assert bench.unit.position("P") == 300
     seen = bench.loop.snapshot
-    assert (seen.pan, seen.tilt, seen.moving) == (300.0, 0.0, False)
+    assert (seen.positions[0], seen.positions[1], seen.moving) == (300.0, 0.0, False)
 
 
 def test_passing_the_goal_is_not_arriving(bench):
@@ -348,11 +348,11 @@ def test_a_halt_comes_first_and_older_moves_are_not_sent(bench):
 def test_a_move_from_before_a_halt_does_not_take_the_place_of_one_from_after(bench):
     bench.start()
     stale = bench.move(1000, 0)
-    bench.loop.moves.clear()  # its thread was interrupted before it got there
+    bench.loop.requests.moves.clear()  # its thread was interrupted before it got there
     bench.halt()
     move = bench.move(500, 0)
     bench.run(0.2)
-    bench.loop.moves.append(stale)
+    bench.loop.requests.moves.append(stale)
     bench.until(stale.done.is_set)
     assert str(stale.error) == "the move was halted"
     bench.until(move.done.is_set)
@@ -366,7 +366,7 @@ def test_after_a_halt_the_same_goal_is_sent_again(bench):
     assert bench.loop.snapshot.moving
     bench.until(lambda: not bench.loop.snapshot.moving)
     assert str(move.error) == "the move was halted"
-    assert bench.loop.snapshot.pan == bench.unit.position("P")
+    assert bench.loop.snapshot.positions[0] == bench.unit.position("P")
     bench.orders()
     bench.until(bench.move(3000, 0).done.is_set)
     assert "PP3000" in bench.orders()
@@ -436,7 +436,7 @@ def test_one_bad_answer_is_asked_for_again(bench, reply):
     bench.until(move.done.is_set)
     assert move.error is None
     assert "H" not in bench.orders()[20:]
-    assert bench.loop.snapshot.pan == 1000
+    assert bench.loop.snapshot.positions[0] == 1000
 
 
 @pytest.mark.parametrize("late", [0.05, 0.2, 0.3, 0.5])
@@ -446,9 +446,9 @@ def test_a_late_answer_is_not_taken_for_another(bench, late):
     for _ in range(200):
         bench.loop.turn()
         # Late by less than a poll's deadline it is the answer, to the question that it answers.
-        assert bench.loop.snapshot.tilt == 0
-        assert bench.loop.snapshot.pan == 0 or late < 0.1
-    assert bench.loop.snapshot.pan == 0
+        assert bench.loop.snapshot.positions[1] == 0
+        assert bench.loop.snapshot.positions[0] == 0 or late < 0.1
+    assert bench.loop.snapshot.positions[0] == 0
 
 
 @pytest.mark.parametrize("newer", [False, True])

@@ -271,7 +271,7 @@ def test_a_book_is_aimed_at_and_the_replay_gives_the_same(rig, capsys):
     there = aim(
         calibration,
         np.array([x, MOUNT_M - z, y]),
-        Reach(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range),
+        Reach(spec.head.limits.pan.range, spec.head.limits.tilt.range, spec.zoom.focal_range),
         wanted_size=WantedSize(book.size, book.wanted_px),
     )
     truth = rig.truth()
@@ -319,7 +319,7 @@ def test_a_rig_is_calibrated_over_the_wire_at_two_focal_lengths(rig, capsys):
     )
     predicted = next(iter(said["predicted_error_deg"].values()))  # at the shortest focal length
     spec = describe(rig.sim)
-    reach = Reach(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range)
+    reach = Reach(spec.head.limits.pan.range, spec.head.limits.tilt.range, spec.zoom.focal_range)
     misses = []
     for pixel in ((100, 100), (540, 100), (320, 240), (100, 380), (540, 380)):
         for depth in (4.0, 6.0, 12.0):

@@ -127,8 +127,8 @@ def test_head_and_lens_go_where_the_action_says(field):
         observation, *_ = env.step(action)
     told, limits, lens = named(observation), env.episode.rig.head.limits, env.episode.rig.zoom
     state = env.episode.rig.head.state()
-    assert state.pan == pytest.approx(0.1 * limits.pan[1], abs=limits.step)  # its range is symmetric
-    assert state.tilt == pytest.approx(limits.tilt[0] + 0.4 * np.ptp(limits.tilt), abs=limits.step)
+    assert state.pan == pytest.approx(0.1 * limits.pan.range[1], abs=limits.pan.step)  # its range is symmetric
+    assert state.tilt == pytest.approx(limits.tilt.range[0] + 0.4 * np.ptp(limits.tilt.range), abs=limits.pan.step)
     shortest, longest = lens.focal_range
     assert lens.state().focal_px == pytest.approx(shortest**0.25 * longest**0.75, rel=0.02)  # a lens of 129 positions
     for name, wanted in zip(("pan", "tilt", "focal"), action, strict=True):

@@ -135,7 +135,7 @@ def test_a_track_keeps_its_slot_and_the_slot_chosen_is_followed(field):
         assert not observation["tracks"][info["action_mask"] == 0].any()
         for each in env.candidates:  # a rate in half ranges a second, a time in parts of 20 s
             row = {name: values[env.slot_of(each.id)] for name, values in tracks.items()}
-            rates = 2 * each.rate / (np.ptp(env.limits.pan), np.ptp(env.limits.tilt))
+            rates = 2 * each.rate / (np.ptp(env.limits.pan.range), np.ptp(env.limits.tilt.range))
             assert (row["pan_rate"], row["tilt_rate"]) == pytest.approx(np.clip(rates, -1, 1), rel=1e-5, abs=1e-6)
             assert row["leaves_in"] == pytest.approx(min(each.leaves_in / 20.0, 1.0), rel=1e-5)
         slot_of = {env.slot_of(each.id): each.id for each in env.candidates}

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import fnmatch
 import inspect
 import itertools
 import json
@@ -54,6 +55,12 @@ from tests.formats.lists import (
     statuses,
     subcommands,
 )
+
+
+@pytest.mark.parametrize("line", listed("reserved.txt"))
+def test_no_listed_name_takes_a_reserved_one(line):
+    name, _, reserved = line.partition(": ")
+    assert not fnmatch.filter(listed(name), reserved)
 
 
 @pytest.fixture

@@ -46,7 +46,7 @@ FAULT = 1.5  # when it happens [s]; by then the target is followed
 # The target crosses at 2 m/s, 10 m away. A command leads the head no farther than 0.15 s of the target's way, what the
 # target has gone since its light fell, and its own way of braking.
 RATE = 0.2
-FARTHEST = RATE * (LATENCY + DELAY + 0.15 + FRAME_S) + RATE**2 / (2 * WIDE.acceleration) + STEP
+FARTHEST = RATE * (LATENCY + DELAY + 0.15 + FRAME_S) + RATE**2 / (2 * WIDE.pan.acceleration) + STEP
 
 
 @dataclass
@@ -89,7 +89,9 @@ def assert_it_comes_to_rest(rig, since):
     way = rig.pose(math.inf)[0] - rig.pose(since)[0]
     assert abs(way) < FARTHEST
     assert rig.pan.motor(since + 0.5)[1] == 0.0
-    assert all(low <= q <= high for q, (low, high) in zip(rig.pose(math.inf), (WIDE.pan, WIDE.tilt), strict=True))
+    assert all(
+        low <= q <= high for q, (low, high) in zip(rig.pose(math.inf), (axis.range for axis in WIDE.axes), strict=True)
+    )
 
 
 # Frames of the fixed camera
@@ -471,7 +473,7 @@ def far_and_near():
 
 @pytest.mark.parametrize("policy", sorted(POLICIES))
 def test_a_target_beyond_the_limits_keeps_the_head_from_no_other(policy):
-    rig = FormulaRig(replace(WIDE, pan=(-0.15, 0.15)))
+    rig = FormulaRig(replace(WIDE, pan=replace(WIDE.pan, range=(-0.15, 0.15))))
     steps = run(rig, far_and_near(), 4.0, selector=POLICIES[policy]())
     alone = [step for step in steps if 0.3 < step.t < 1.0]
     assert {step.state for step in alone} == {State.UNREACHABLE}
@@ -482,7 +484,7 @@ def test_a_target_beyond_the_limits_keeps_the_head_from_no_other(policy):
 
 
 def test_a_chosen_target_beyond_the_limits_is_not_exchanged():
-    rig = FormulaRig(replace(WIDE, pan=(-0.15, 0.15)))
+    rig = FormulaRig(replace(WIDE, pan=replace(WIDE.pan, range=(-0.15, 0.15))))
     steps = run(rig, far_and_near(), 3.0, selector=Chosen(number=1))
     assert {(step.state, step.target.id) for step in steps if step.t > 0.3} == {(State.UNREACHABLE, 1)}
     assert not rig.moves

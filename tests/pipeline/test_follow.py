@@ -112,7 +112,7 @@ def test_head_goes_on_with_a_target_that_is_lost():
 
 
 def test_head_waits_where_a_lost_target_is_beyond_its_limits():
-    rig = FormulaRig(replace(WIDE, pan=(-0.15, 0.1)))
+    rig = FormulaRig(replace(WIDE, pan=replace(WIDE.pan, range=(-0.15, 0.1))))
     last = [step for step in run(rig, Seer(crossing, lambda t: t < 1.7), 2.6) if step.state is State.LOST][-1]
     assert last.reason.startswith("out of sight for 0.8 s; the head waits: ")
     assert "beyond the limits" in last.reason
@@ -189,7 +189,7 @@ def test_lens_zooms_in_only_as_far_as_the_target_stays_in_the_image():
 
 def test_target_that_comes_within_reach_is_followed():
     """It comes within the limits of the head from the left, and leaves them on the right."""
-    rig = FormulaRig(replace(WIDE, pan=(-0.15, 0.15)))
+    rig = FormulaRig(replace(WIDE, pan=replace(WIDE.pan, range=(-0.15, 0.15))))
     seen = [state for state, _ in spans(run(rig, Seer(crossing), 3.0))]
     assert seen == [State.SEARCHING, State.UNREACHABLE, State.FOLLOWING, State.UNREACHABLE]
     assert all(-0.15 <= pan <= 0.15 for _, pan, *_ in rig.moves)

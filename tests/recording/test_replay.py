@@ -387,7 +387,9 @@ def test_a_replayed_rig_has_the_recorded_spec(tmp_path):
     record(tmp_path / "run", path, rig, seconds=0.2)
     assert Replay(open_recording(tmp_path / "run")).rig.spec == rig.spec
     config = RigConfig(backend="replay", recording=tmp_path / "run", safety=SafetyConfig(pan_deg=(-10.0, 10.0)))
-    limits = dataclasses.replace(LIMITS, pan=(math.radians(-10.0), math.radians(10.0)))
+    limits = dataclasses.replace(
+        LIMITS, pan=dataclasses.replace(LIMITS.pan, range=(math.radians(-10.0), math.radians(10.0)))
+    )
     spec = dataclasses.replace(rig.spec, head=dataclasses.replace(other, limits=limits))
     assert describe(config) == spec
     with open_rig(config) as played:

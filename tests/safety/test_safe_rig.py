@@ -10,15 +10,13 @@ import pytest
 
 from cotarget.config import SafetyConfig
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
-from cotarget.rig import Frame, PanTiltLimits, PanTiltState
-from tests.support.rigs import guarded, rig_of
+from cotarget.rig import Frame, PanTiltState
+from tests.support.rigs import alike, guarded, rig_of
 
 STEP = math.radians(0.0514286)
 SPEED = math.radians(149.0)
 ROUNDING = 1e-12  # degrees to radians and back, and a multiple of a step
-LIMITS = PanTiltLimits(
-    (math.radians(-158.9), math.radians(158.9)), (math.radians(-46.6), math.radians(31.1)), SPEED, 3.6, STEP
-)
+LIMITS = alike((math.radians(-158.9), math.radians(158.9)), (math.radians(-46.6), math.radians(31.1)), SPEED, 3.6, STEP)
 
 
 class Head:
@@ -31,7 +29,7 @@ class Head:
         return PanTiltState(*self.pose, moving=False, t=0.0)
 
     def move(self, pan, tilt, speed=None, wait=False):
-        step = self.limits.step
+        step = self.limits.pan.step
         self.pose = tuple(round(q / step) * step if step else q for q in (pan, tilt))
         self.log.append((*self.pose, speed, wait))
         return self.pose
@@ -70,7 +68,7 @@ def inside(angle, limits):
 ])  # fmt: skip
 def test_no_command_leaves_the_limits_or_exceeds_the_cap(step, soft):
     rng = np.random.default_rng(1)
-    head = Head(PanTiltLimits(LIMITS.pan, LIMITS.tilt, SPEED, 3.6, step))
+    head = Head(alike(LIMITS.pan.range, LIMITS.tilt.range, SPEED, 3.6, step))
     allowed = []
     for wanted, device in ((soft.pan_deg, (-158.9, 158.9)), (soft.tilt_deg, (-46.6, 31.1))):
         low, high = wanted or device
@@ -90,15 +88,15 @@ def test_no_command_leaves_the_limits_or_exceeds_the_cap(step, soft):
     pan, tilt = (np.mean(limits) for limits in allowed)  # what is allowed is done, to a step
     said = safe.move(pan, tilt)
     assert np.allclose(said, (pan, tilt), rtol=0, atol=step / 2 + ROUNDING)
-    for shown, limits in zip((safe.limits.pan, safe.limits.tilt), allowed, strict=True):
+    for shown, limits in zip((safe.limits.pan.range, safe.limits.tilt.range), allowed, strict=True):
         assert np.allclose(shown, limits, rtol=0, atol=ROUNDING)
-    assert safe.limits.speed == pytest.approx(cap)
+    assert safe.limits.pan.speed == pytest.approx(cap)
 
 
 # Every pair of these as angles [rad], with each of the speeds: all directions, edges, and results of arithmetic.
 AWKWARD = [
     *(math.radians(d) for d in range(-200, 201, 8)),
-    *(e + d for limits in (LIMITS.pan, LIMITS.tilt) for e in limits for d in (-STEP, -1e-9, 0.0, 1e-9, STEP)),
+    *(e + d for axis in LIMITS.axes for e in axis.range for d in (-STEP, -1e-9, 0.0, 1e-9, STEP)),
     0.0, -0.0, 5e-324, 1e-300, 1e300, -1e300, 1.8e308, math.inf, -math.inf, math.nan,
 ]  # fmt: skip
 SPEEDS = [None, 5e-324, 1e-9, math.radians(40.0), SPEED, 1e300, math.inf, 0.0, -0.0, -1.0, -math.inf, math.nan]
@@ -106,7 +104,7 @@ SPEEDS = [None, 5e-324, 1e-9, math.radians(40.0), SPEED, 1e300, math.inf, 0.0, -
 
 @pytest.mark.parametrize("step", [STEP, 0.0])
 def test_every_command_is_done_within_the_limits_or_refused(step):
-    head = Head(PanTiltLimits(LIMITS.pan, LIMITS.tilt, SPEED, 3.6, step))
+    head = Head(alike(LIMITS.pan.range, LIMITS.tilt.range, SPEED, 3.6, step))
     safe = guarded(Devices(head), SafetyConfig(pan_deg=(-90.0, 45.0), speed_deg_s=30.0)).head
     pan_limits, cap = (math.radians(-90.0), math.radians(45.0)), math.radians(30.0)
     for pan, tilt in itertools.product(AWKWARD, AWKWARD):
@@ -121,27 +119,27 @@ def test_every_command_is_done_within_the_limits_or_refused(step):
             safe.move(pan, tilt, speed)
             ((done_pan, done_tilt, done_speed, _),) = head.log
             assert inside(done_pan, pan_limits)
-            assert inside(done_tilt, LIMITS.tilt)
+            assert inside(done_tilt, LIMITS.tilt.range)
             assert 0 < done_speed <= cap + ROUNDING
 
 
 @pytest.mark.parametrize(("change", "key"), [
-    ({"pan": (math.nan, 1.0)}, r"safety\.pan_deg"),
-    ({"tilt": (-1.0, math.nan)}, r"safety\.tilt_deg"),
-    ({"tilt": (1.0, -1.0)}, r"safety\.tilt_deg"),
-    ({"pan": (-math.inf, math.inf)}, r"safety\.pan_deg"),  # an endless axis needs soft limits
-    ({"speed": math.nan}, "speed of nan"),
+    ({"range": (math.nan, 1.0)}, r"safety\.tilt_deg"),
+    ({"range": (-1.0, math.nan)}, r"safety\.tilt_deg"),
+    ({"range": (1.0, -1.0)}, r"safety\.tilt_deg"),
+    ({"range": (-math.inf, math.inf)}, r"safety\.tilt_deg"),  # an endless axis needs soft limits
+    ({"speed": math.nan}, "tilt a speed of nan"),
     ({"acceleration": math.nan}, "acceleration of nan"),
     ({"step": math.nan}, "step of nan"),
     *(({"slack": slack}, f"slack of {slack}") for slack in (math.nan, math.inf, -1.0)),
 ])  # fmt: skip
 def test_a_head_without_usable_limits_is_refused(change, key):
-    rig = Devices(Head(replace(LIMITS, **change)))
+    rig = Devices(Head(replace(LIMITS, tilt=replace(LIMITS.tilt, **change))))
     with pytest.raises(ConfigError, match=key):
         guarded(rig, SafetyConfig())
     assert rig.closed
-    endless = Devices(Head(replace(LIMITS, pan=(-math.inf, math.inf))))
-    assert guarded(endless, SafetyConfig(pan_deg=(-90.0, 90.0))).head.limits.pan == (-math.pi / 2, math.pi / 2)
+    endless = Devices(Head(replace(LIMITS, pan=replace(LIMITS.pan, range=(-math.inf, math.inf)))))
+    assert guarded(endless, SafetyConfig(pan_deg=(-90.0, 90.0))).head.limits.pan.range == (-math.pi / 2, math.pi / 2)
 
 
 @pytest.mark.parametrize("pose", [(math.nan, 0.0), (0.0, math.nan), (0.0, math.inf)])
@@ -170,7 +168,7 @@ def test_a_head_that_reports_a_goal_beyond_the_limits_is_halted(said):
 
 
 def test_a_head_of_unlimited_speed_gets_no_speed():
-    head = Head(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), math.inf, math.inf, 0.0))
+    head = Head(alike((-1.0, 1.0), (-1.0, 1.0), math.inf, math.inf, 0.0))
     safe = guarded(Devices(head), SafetyConfig()).head
     safe.move(0.1, 0.1)
     safe.move(0.2, 0.2, wait=True)
@@ -309,8 +307,9 @@ def test_a_closed_rig_is_not_closed_again_and_does_not_move():
 
 def test_a_guarded_rigs_spec_has_the_soft_limits():
     spec = guarded(Devices(), SafetyConfig(pan_deg=(-90.0, 45.0), speed_deg_s=30.0)).spec
-    assert spec.head.limits.pan == pytest.approx((math.radians(-90.0), math.radians(45.0)))
-    assert (spec.head.limits.tilt, spec.head.limits.speed) == (LIMITS.tilt, pytest.approx(math.radians(30.0)))
+    assert spec.head.limits.pan.range == pytest.approx((math.radians(-90.0), math.radians(45.0)))
+    assert spec.head.limits.tilt.range == LIMITS.tilt.range
+    assert [axis.speed for axis in spec.head.limits.axes] == pytest.approx([math.radians(30.0)] * 2)
 
 
 def test_a_guarded_rig_is_not_guarded_again_and_stays_open():

@@ -5,7 +5,6 @@ import math
 import os
 import threading
 import time
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +13,7 @@ from cotarget.config import SafetyConfig, SimHead
 from cotarget.errors import DeviceError, EmergencyStopError, StaleFrameError
 from cotarget.rig import Frame, PanTiltState
 from cotarget.safety import stop_file, watchdog
-from tests.support.rigs import guarded
+from tests.support.rigs import guarded, with_axes
 from tests.support.safety_rigs import DEADLINE_S, IMAGE, RealDevices, SimulatedDevices
 
 WATCHDOG_S = 0.35  # the default
@@ -57,7 +56,7 @@ def test_a_head_without_a_sign_of_life_is_halted_after_the_watchdogs_time(rig, s
     # It sped up for half a second and braked as long: a t^2 in all, far from its goal.
     acceleration = math.radians(SimHead().accel_deg_s2)
     assert acceleration * WATCHDOG_S < math.radians(SimHead().speed_deg_s)
-    step = rig.head.limits.step
+    step = rig.head.limits.pan.step
     assert safe.head.state().pan == pytest.approx(acceleration * WATCHDOG_S**2, abs=step)
     assert warnings(caplog) == ["halting the head: neither a fresh frame nor a command for 0.35 s"]
     safe.head.move(FAR, 0.0)  # obeyed and watched again
@@ -78,7 +77,7 @@ def test_fresh_frames_and_commands_are_signs_of_life(rig, safe, sign):
     safe.head.move(FAR, 0.0)
     while safe.clock.now() < 3.0:
         sign(safe)
-    assert safe.head.state().pan == pytest.approx(FAR, abs=rig.head.limits.step)
+    assert safe.head.state().pan == pytest.approx(FAR, abs=rig.head.limits.pan.step)
     assert not rig.head.halts
 
 
@@ -115,7 +114,7 @@ def test_a_head_that_has_arrived_is_not_watched(rig, safe, caplog):
     safe.head.move(FAR, 0.0, wait=True)
     assert safe.clock.now() > 2 * WATCHDOG_S
     safe.clock.sleep_until(60.0)
-    assert safe.head.state().pan == pytest.approx(FAR, abs=rig.head.limits.step)
+    assert safe.head.state().pan == pytest.approx(FAR, abs=rig.head.limits.pan.step)
     assert not rig.head.halts
     assert not warnings(caplog)
 
@@ -141,7 +140,7 @@ def test_a_head_that_rests_off_its_goal_is_watched(rig, safe, goal):
 
 
 def test_a_servo_that_rests_within_its_slack_has_arrived(rig):
-    rig.head.limits = replace(rig.head.limits, slack=math.radians(0.3))
+    rig.head.limits = with_axes(rig.head.limits, slack=math.radians(0.3))
     rig.head.state = lambda: PanTiltState(math.radians(0.35), 0.0, moving=False, t=rig.clock.now())
     with guarded(rig, SafetyConfig()) as safe:
         safe.head.move(0.0, 0.0)
@@ -259,7 +258,7 @@ def test_a_failed_halt_is_logged_and_repeated_before_the_next_command(rig, safe,
     safe.head.state()  # the third
     assert not rig.head.halts
     said = safe.head.move(FAR, 0.0)  # the fourth is obeyed, and so is the command
-    assert said[0] == pytest.approx(FAR, abs=rig.head.limits.step)
+    assert said[0] == pytest.approx(FAR, abs=rig.head.limits.pan.step)
     assert [what for what, _ in rig.head.log] == ["move", "halt", "move"]
     assert warnings(caplog)[-1] == "the head is halted now"
 
@@ -337,7 +336,7 @@ TICK_S = 0.001  # between looks at a head that never arrives
     ((1.0, 0.0), None, False, 1.0 / 4 + 0.1),
     ((0.2, -1.0), None, False, 1.0 / 4 + 0.1),  # the longer way counts
     ((0.1, 0.0), None, False, 2 * 0.05),  # 0.05 s to half way, and as long to brake: 40 rad/s^2 0.05^2 = 0.1 rad
-    ((1.0, 0.5), (4.0, 1.0), False, 1.0 / 1 + 1.0 / 40),  # the slower axis counts
+    ((1.0, 0.5), (4.0, 1.0), False, 0.5 / 1 + 1.0 / 40),  # the axis that arrives last counts
     ((0.0, 0.0), None, False, 0.0),  # it is there already
     ((1.0, 0.0), None, True, 1.0 / 4 + 0.1 + 2 * 0.1),  # it may move the other way: it brakes and speeds up first
 ])  # fmt: skip

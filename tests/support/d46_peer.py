@@ -193,7 +193,7 @@ class Bench:
 
     def move(self, pan, tilt, speed=1000, wait=False):
         move = Move(next(self.numbers), (pan, tilt), (speed, speed), wait)
-        self.loop.moves.append(move)
+        self.loop.requests.moves.append(move)
         return move
 
     def orders(self):
@@ -204,5 +204,5 @@ class Bench:
 
     def halt(self):
         wish = Halt(next(self.numbers))
-        self.loop.halts.append(wish)
+        self.loop.requests.halts.append(wish)
         return wish

@@ -16,7 +16,7 @@ from cotarget.rig import Detection, Frame, PanTiltLimits, PanTiltState, ZoomStat
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.motion import Axis
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
-from tests.support.rigs import rig_of
+from tests.support.rigs import alike, rig_of
 from tests.support.simulated_clock import RigClock
 
 RATE_HZ = 24.0  # neither 0.4 s nor 0.8 s is a whole number of frames
@@ -33,7 +33,7 @@ CALIBRATION = Calibration(
         ZoomLens((667.0,), (Intrinsics(SIZE, (692.0, 693.0), (326.0, 235.0)),)), TRUTH.gamma, TRUTH.hand
     ),
 )
-WIDE = PanTiltLimits((-2.7, 2.7), (-0.8, 0.5), math.radians(149), math.radians(206), STEP)
+WIDE = alike((-2.7, 2.7), (-0.8, 0.5), math.radians(149), math.radians(206), STEP)
 PICTURES = [np.full((SIZE[1], SIZE[0], 3), level, np.uint8) for level in (0, 1)]  # those of a live camera differ
 
 
@@ -51,7 +51,7 @@ class FormulaRig:
     zooms: list = field(default_factory=list)  # time and focal length of each command
 
     def __post_init__(self):
-        self.pan, self.tilt = (Axis(self.limits.speed, self.limits.acceleration) for _ in range(2))
+        self.pan, self.tilt = (Axis(self.limits.pan.speed, self.limits.pan.acceleration) for _ in range(2))
         self.focal = self.focal_before = self.focal_range[0]
         self.fixed, self.zoom, self.head, self.clock = _Camera(self), _Zoom(self), _Head(self), RigClock(self)
 
@@ -114,9 +114,10 @@ class _Head:
         return PanTiltState(*self.rig.pose(self.rig.t), moving, self.rig.t)
 
     def move(self, pan, tilt, speed=None, wait=False):
-        rig, step = self.rig, self.rig.limits.step
+        rig, step = self.rig, self.rig.limits.pan.step
         rounded = (round(q / step) * step if step else q for q in (pan, tilt))
-        goal = [min(max(q, lo), hi) for q, (lo, hi) in zip(rounded, (rig.limits.pan, rig.limits.tilt), strict=True)]
+        ranges = [axis.range for axis in rig.limits.axes]
+        goal = [min(max(q, low), high) for q, (low, high) in zip(rounded, ranges, strict=True)]
         for axis, q, fastest in zip((rig.pan, rig.tilt), goal, rig.limits.capped(speed), strict=True):
             axis.command(rig.t + rig.delay_s, q, fastest)
         rig.moves.append((rig.t, *goal, speed))

@@ -20,9 +20,9 @@ from cotarget.detection import Detections
 from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.recording.recorder import Recorder
-from cotarget.rig import Detection, Frame, PanTiltLimits, PanTiltState, ZoomState
+from cotarget.rig import Detection, Frame, PanTiltState, ZoomState
 from cotarget.rig_geometry import FixedCamera, ZoomHead
-from tests.support.rigs import guarded, rig_of
+from tests.support.rigs import alike, guarded, rig_of
 from tests.support.simulated_clock import RigClock
 
 SIZE = (96, 72)
@@ -31,7 +31,7 @@ LATENCY = 0.06
 TICK = 1e-4  # each look at the clock takes so long, so that an answer given in another order is another answer [s]
 STEP = math.radians(0.0514286)
 SPEED = math.radians(149)
-LIMITS = PanTiltLimits((-2.7, 2.7), (-0.8, 0.5), SPEED, math.radians(206), STEP)
+LIMITS = alike((-2.7, 2.7), (-0.8, 0.5), SPEED, math.radians(206), STEP)
 FOCALS = (100.0, 1200.0)
 CONFIG = RigConfig(targets={"bird": replace(DEFAULT_TARGETS["bird"], wanted_px=30.0)})
 SETTINGS = FollowSettings()
@@ -120,7 +120,7 @@ class ToyHead:
     def move(self, pan, tilt, speed=None, wait=False):
         self.rig.count("head.move")
         self.rig.start, self.rig.since = self.rig.pose(), self.rig.t
-        low, high = np.array([LIMITS.pan, LIMITS.tilt]).T
+        low, high = np.array([axis.range for axis in LIMITS.axes]).T
         self.rig.goal = np.clip(np.round(np.array([pan, tilt]) / STEP) * STEP, low, high)
         return float(self.rig.goal[0]), float(self.rig.goal[1])
 

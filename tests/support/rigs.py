@@ -3,11 +3,21 @@
 from dataclasses import replace
 
 from cotarget.config import SafetyConfig
-from cotarget.rig import CameraSpec, HeadSpec, Rig, RigSpec, ZoomSpec
+from cotarget.rig import AxisLimits, CameraSpec, HeadSpec, PanTiltLimits, Rig, RigSpec, ZoomSpec
 from cotarget.safety.safe_rig import guard
 
 RATE_HZ, LATENCY_S, DELAY_S = 25.0, 0.06, 0.04
 SIZE, FOCALS = (2, 2), (100.0, 1200.0)  # of a camera that does not say them
+
+
+def alike(pan, tilt, speed, acceleration, step, slack=0.0):
+    """Limits of a head whose axes differ in their ranges alone [rad]."""
+    return PanTiltLimits(*(AxisLimits(each, speed, acceleration, step, slack) for each in (pan, tilt)))
+
+
+def with_axes(limits, **changes):
+    """The limits with fields of both axes replaced."""
+    return PanTiltLimits(*(replace(axis, **changes) for axis in limits.axes))
 
 
 def rig_of(devices, *, delay_s=DELAY_S, config=None) -> Rig:

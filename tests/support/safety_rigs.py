@@ -8,8 +8,9 @@ import numpy as np
 
 from cotarget.config import RigConfig, SimEffects, SimHead
 from cotarget.errors import StaleFrameError
-from cotarget.rig import Frame, PanTiltLimits, PanTiltState
+from cotarget.rig import Frame, PanTiltState
 from cotarget.sim.devices import SimClock, SimPanTilt, head_drive, rig_spec
+from tests.support.rigs import alike
 
 IMAGE = np.zeros((2, 2, 3), np.uint8)
 DEADLINE_S = 20.0  # for whatever must happen at all, on a machine that is busy with other things
@@ -79,7 +80,7 @@ class SimulatedDevices:
 class RealHead:
     """A head that does not move; `hang` is called during each move."""
 
-    limits = PanTiltLimits((-2.0, 2.0), (-1.0, 1.0), 4.0, 40.0, 0.0)
+    limits = alike((-2.0, 2.0), (-1.0, 1.0), 4.0, 40.0, 0.0)
 
     def __init__(self):
         self.log, self.failing = [], 0

@@ -15,7 +15,7 @@ from cotarget.errors import StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Stop, Truth
-from tests.support.rigs import rig_of
+from tests.support.rigs import alike, rig_of
 from tests.support.simulated_clock import RigClock
 
 PERIOD = 0.04
@@ -119,7 +119,7 @@ class SyntheticRig:
     optics: Callable[[float], Stop] | None = None
     reported: float = 1.0  # focal length that the lens reports, over its nominal one
     limits: PanTiltLimits = field(
-        default_factory=lambda: PanTiltLimits(
+        default_factory=lambda: alike(
             (np.radians(-159), np.radians(159)), (np.radians(-47), np.radians(31)), 2.6, 3.6, np.radians(0.0514286)
         )
     )
@@ -224,10 +224,10 @@ class _Head:
 
     def move(self, pan, tilt, speed=None, wait=False):
         rig = self.rig
-        step = rig.limits.step
+        step = rig.limits.pan.step
         wanted = tuple(
             float(np.clip(np.round(q / step) * step, *limit))
-            for q, limit in ((pan, rig.limits.pan), (tilt, rig.limits.tilt))
+            for q, limit in ((pan, rig.limits.pan.range), (tilt, rig.limits.tilt.range))
         )
         if not rig.stuck:
             rig.arrives = rig.t + 0.3
