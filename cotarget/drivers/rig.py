@@ -4,7 +4,7 @@ import contextlib
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from numbers import Integral, Real
 from pathlib import Path
@@ -17,7 +17,7 @@ from cotarget.drivers import DRIVERS
 from cotarget.drivers.board import BoardSettings, make_board
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import addresses_of, rig_lock
-from cotarget.errors import ConfigError, choices
+from cotarget.errors import ConfigError, DeviceError, choices
 from cotarget.plugins import FORM, Answer, Reporting, calling, check_attribute, is_own, load
 from cotarget.rig import (
     CameraSpec,
@@ -171,7 +171,7 @@ class Device:
         if not hasattr(self.driver, "probe"):
             return None
         lock = rig_lock(*addresses_of(self.settings)) if self.role in ("head", "ptz") else contextlib.nullcontext()
-        with lock, calling(self.where):
+        with lock, self._naming():
             return str(self.driver.probe(self.settings))
 
     def open(self, *arguments: Any) -> Any:
@@ -181,14 +181,20 @@ class Device:
             ConfigError: the device differs from its settings.
             DeviceError: the device cannot be opened, or an attribute is not what it has to be.
         """
-        if not self.own:
-            return self.driver(self.settings, *arguments)
+        with self._naming():
+            device = self.driver(self.settings, *arguments)
+        return self._reporting(device, self.role) if self.own else device
+
+    @contextlib.contextmanager
+    def _naming(self) -> Iterator[None]:
+        """Call the driver; its errors name the device's own table, which may be another than its messages say."""
         try:
-            with calling(self.where):
-                device = self.driver(self.settings, *arguments)
-        except ConfigError as error:  # a driver may stand in another table than its messages say
-            raise ConfigError(re.sub(r"^hardware\.\w+\b", self.where, str(error))) from error
-        return self._reporting(device, self.role)
+            with calling(self.where) if self.own else contextlib.nullcontext():
+                yield
+        except (ConfigError, DeviceError) as error:
+            if (text := re.sub(r"^hardware\.\w+\b", self.where, str(error))) == str(error):
+                raise
+            raise (ConfigError if isinstance(error, ConfigError) else DeviceError)(text) from error
 
     def open_unit(self, *arguments: Any) -> Unit:
         """Open a device that is a zoom camera and a head in one housing. Raises as `open` does."""
