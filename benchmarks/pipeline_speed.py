@@ -87,7 +87,7 @@ class Pipeline:
         targets, T_base_fixed = self.fusion.targets, self.calibration.zoom_head.T_base_fixed
         candidates = candidates_of(targets.values(), frame.t, T_base_fixed, self.size)
         number = self.policy.select(candidates, np.zeros(2), self.limits)
-        self.search.follow(None if number is None else targets[number])
+        self.search.search_for(None if number is None else targets[number])
         estimate = None if number is None else targets[number].estimate(frame.t + LEAD_S)
         tracked = time.perf_counter()
         if estimate is not None:

@@ -195,7 +195,7 @@ class ZoomSearch:
         self.target: Target | None = None
         self.finder, self.unfound_s = self._make_finder(), 0.0
 
-    def follow(self, target: Target | None) -> None:
+    def search_for(self, target: Target | None) -> None:
         """Search for another target from now on; None for none."""
         if target is not self.target:
             self.target = target

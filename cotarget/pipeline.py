@@ -337,7 +337,7 @@ def follow(
     _check_seconds(seconds)
     name, profile = _profile(rig, target)
     check_run(calibration, rig.spec, profile, name, insist=insist)
-    yield from run_steps(rig, calibration, profile, detector, selector=selector, seconds=seconds, settings=settings)
+    yield from Run(rig, calibration, profile, detector, selector=selector, settings=settings).follow(seconds)
 
 
 def check_run(
@@ -374,26 +374,6 @@ def check_run(
             check_shown(spec, name)
         if not insist and (text := target_implausibility(target, calibration, spec, name)):
             raise ConfigError(f"{text}; insist=True follows it all the same")
-
-
-def run_steps(
-    rig: Rig,
-    calibration: Calibration,
-    target: TargetProfile,
-    detector: Detector | None = None,
-    *,
-    selector: TargetSelector | None = None,
-    seconds: float = math.inf,
-    settings: FollowSettings | None = None,
-) -> Iterator[Step]:
-    """Yield the steps of a run that `check_run` has let pass; the arguments are those of `follow`."""
-    if detector is None:
-        detector = make_detector(target, rig.spec.fixed.rate_hz)
-    fitting = calibration.for_streams(rig.fixed.size, rig.zoom.size)
-    run = _Run(rig, fitting, target, detector, selector or FirstCome(), settings or FollowSettings())
-    end = rig.clock.now() + seconds
-    while rig.clock.now() < end:
-        yield run.step()
 
 
 def _check_seconds(seconds: object) -> None:
@@ -474,7 +454,7 @@ class HeadRun:
         candidates = candidates_of(targets, now, self._T_base_fixed, self._rig.fixed.size)
         number = self._selector.select(candidates, head, self._rig.head.limits)
         found = next((target for target in targets if target.id == number), None)
-        self.search.follow(found)
+        self.search.search_for(found)
         return found
 
     def wait(self, found: Detections, tracks: Sequence[Track]) -> Outcome:
@@ -488,7 +468,7 @@ class HeadRun:
         why = part and f": {part:.0%} of the fixed image changed at once, as when the light does or the camera moves"
         return State.SEARCHING, (f"nothing is detected{why or ''}",), None
 
-    def follow(self, target: Target, t: float, interval: float) -> Outcome:
+    def aim_at(self, target: Target, t: float, interval: float) -> Outcome:
         """Aim at a target and command head and lens.
 
         Args:
@@ -533,41 +513,61 @@ class HeadRun:
         return "looked for where it should be", aim
 
 
-class _Run:
-    """One run of `follow`: a camera, the fusion, and a head."""
+class Run:
+    """One run of the pipeline on a rig: a camera, the fusion, and a head.
+
+    Attributes:
+        camera: detects and tracks in the fixed camera's frames.
+        fusion: keeps the targets with their 3D filters.
+        head: follows one of the targets.
+    """
 
     def __init__(
         self,
         rig: Rig,
         calibration: Calibration,
-        profile: TargetProfile,
-        detector: Detector,
-        selector: TargetSelector,
-        settings: FollowSettings,
+        target: TargetProfile,
+        detector: Detector | None = None,
+        *,
+        selector: TargetSelector | None = None,
+        settings: FollowSettings | None = None,
     ) -> None:
+        """Start a run that `check_run` has let pass, and send the lens to its shortest focal length.
+
+        The arguments are those of `cotarget.follow`.
+        """
+        detector = make_detector(target, rig.spec.fixed.rate_hz) if detector is None else detector
+        calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
+        selector, settings = selector or FirstCome(), settings or FollowSettings()
+        settings = replace(settings, filter=settings.filter or filter_settings(target, calibration))
         self._rig, self._selector = rig, selector
         self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
-        self._camera = CameraRun(detector, Tracker(settings.tracking or tracking_settings(profile), rig.fixed.size))
-        settings = replace(settings, filter=settings.filter or filter_settings(profile, calibration))
-        self._fusion = TargetFusion(calibration, profile, settings.filter, settings.fusion)
-        self._head = HeadRun(rig, calibration, profile, selector, settings)
+        self.camera = CameraRun(detector, Tracker(settings.tracking or tracking_settings(target), rig.fixed.size))
+        self.fusion = TargetFusion(calibration, target, settings.filter, settings.fusion)
+        self.head = HeadRun(rig, calibration, target, selector, settings)
         self._index = 0
+
+    def follow(self, seconds: float = math.inf) -> Iterator[Step]:
+        """Yield one Step for each frame of the fixed camera, for a time on the rig's clock [s]."""
+        end = self._rig.clock.now() + seconds
+        while self._rig.clock.now() < end:
+            yield self.step()
 
     def step(self) -> Step:
         """Process one frame of the fixed camera, in the order of the paper's Table 1."""
-        frames, head = self._frames, self._head
+        frames, head = self._frames, self.head
         frame = frames.read_fixed()
-        detections, tracks = self._camera.track(frame), self._camera.tracks
+        detections, tracks = self.camera.track(frame), self.camera.tracks
         favoured = {track.id for track in tracks if self._selector.favours(track)}
-        self._fusion.add_tracks(frame, tracks, detections.mask, [head.search], favoured)
+        self.fusion.add_tracks(frame, tracks, detections.mask, [head.search], favoured)
         head.read_states()
         zoom = frames.read_zoom()
         found = head.search.add_frame(zoom if frames.zoom_is_new else None, frame.t)
-        target = head.select(self._fusion.targets.values())
+        target = head.select(self.fusion.targets.values())
         if target is None:
             state, reasons, aim = head.wait(detections, tracks)
         else:
-            state, reasons, aim = head.follow(target, frame.t, min(frames.interval, LONGEST_INTERVAL_S))
+            state, reasons, aim = head.aim_at(target, frame.t, min(frames.interval, LONGEST_INTERVAL_S))
         head.read_states()
         estimate = None if target is None else target.estimate(frame.t)
         self._index += 1

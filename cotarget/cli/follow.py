@@ -16,7 +16,7 @@ from cotarget.cli.common import (
     rig_files,
 )
 from cotarget.cli.pipeline_run import (
-    Run,
+    RunInputs,
     Selection,
     add_outputs,
     add_selection,
@@ -87,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
             return guard(recorder.wrap(rig) if recorder else rig, config.safety)
 
         expected = None if math.isinf(seconds) else math.ceil(seconds * rate_hz)
-        run = Run(opened, config, calibration, name, rate_hz, selection, seconds, expected)
+        run = RunInputs(opened, config, calibration, name, rate_hz, selection, seconds, expected)
         result = run_observed(run, options)
         if result.interrupt is None:  # a run cut short may not have had the time to see anything
             warn_if_unseen("follow", run, result.counts)

@@ -10,7 +10,7 @@ import re
 import statistics
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -43,7 +43,7 @@ def output_files(options: argparse.Namespace) -> list[Path | None]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
+class RunInputs:
     """Inputs of a run of the pipeline.
 
     Attributes:
@@ -95,7 +95,7 @@ class Observer(Protocol):
         """One line on what was wrong in the run; empty if nothing was."""
 
 
-def run_observed(run: Run, options: argparse.Namespace, *more: Observer) -> Result:
+def run_observed(run: RunInputs, options: argparse.Namespace, *more: Observer) -> Result:
     """Follow a target with progress, table and film.
 
     However the run ends, the head is halted before the files are completed. Ctrl-C is the usual end of a run whose
@@ -103,7 +103,7 @@ def run_observed(run: Run, options: argparse.Namespace, *more: Observer) -> Resu
     """
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
-    from cotarget.pipeline import run_steps
+    from cotarget.pipeline import Run
     from cotarget.recording.recorder import COLUMNS, step_row, utc_text
     from cotarget.recording.replay import until_end
     from cotarget.safety.signals import deferred_signals
@@ -126,10 +126,13 @@ def run_observed(run: Run, options: argparse.Namespace, *more: Observer) -> Resu
                 epoch = datetime.now(UTC) - timedelta(seconds=rig.clock.now())
             if film is not None:
                 film.epoch = epoch
-            selector = run.selection.selector
-            steps = run_steps(rig, run.calibration, target, detector, selector=selector, seconds=run.seconds)
+
+            def steps() -> "Iterator[Step]":  # a recording may end before the first step
+                selector = run.selection.selector
+                yield from Run(rig, run.calibration, target, detector, selector=selector).follow(run.seconds)
+
             try:
-                for step in until_end(steps, run.replay):
+                for step in until_end(steps(), run.replay):
                     with deferred_signals():  # table, counts and film have the same steps
                         if table is not None:
                             table.write(step_row(step, epoch))
@@ -171,7 +174,7 @@ NEEDED = {
 }
 
 
-def warn_if_unseen(command: str, run: Run, counts: "StepCounts") -> None:
+def warn_if_unseen(command: str, run: RunInputs, counts: "StepCounts") -> None:
     """Print a hint if no target was detected in the whole run."""
     if not counts.only_searched or run.selection.warning:
         return

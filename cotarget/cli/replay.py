@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from cotarget.cli.common import add_file, check_outputs, print_json, rig_files, scores_of
 from cotarget.cli.pipeline_run import (
-    Run,
+    RunInputs,
     Selection,
     add_outputs,
     add_selection,
@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
     def opened() -> "Rig":
         return guard(played.rig, config.safety)
 
-    run = Run(opened, config, calibration, name, rate_hz, selection, math.inf, recording.steps, played)
+    run = RunInputs(opened, config, calibration, name, rate_hz, selection, math.inf, recording.steps, played)
     result = run_observed(run, options, seen)
     if result.interrupt is not None:
         raise result.interrupt

@@ -149,11 +149,11 @@ def _followed(
     options: argparse.Namespace, config: "RigConfig", calibration: "Calibration", world: "SimWorld", rig: "Rig"
 ) -> "Iterator[Snapshot]":
     from cotarget.drawing import draw_wide, draw_zoom
-    from cotarget.pipeline import run_steps
+    from cotarget.pipeline import Run
     from cotarget.sim.viewer.scene import Snapshot, frusta_of
 
     truth, name = world.truth(), options.target
-    for step in run_steps(rig, calibration, config.target(name)):
+    for step in Run(rig, calibration, config.target(name)).follow():
         depths = {} if step.aim is None else {"zoom": step.aim.range}
         caption = f"t = {step.t:.1f} s   {name}: {step.state}"
         pictures = {"fixed": draw_wide(step), "zoom": draw_zoom(step)}

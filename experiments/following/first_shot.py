@@ -189,7 +189,7 @@ class _Shooter:
         number = self._policy.select(candidates, np.array([state.pan, state.tilt]), self._rig.head.limits)
         self._number = number
         for fusion, search in self._fusions:
-            search.follow(None if number is None else fusion.targets[number])
+            search.search_for(None if number is None else fusion.targets[number])
 
     def shoot(self) -> Shot | None:
         """Aim at the track for the first zoom frame that can be exposed then, and wait for it; None if out of reach."""

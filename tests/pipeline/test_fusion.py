@@ -67,7 +67,7 @@ class Pair:
 
     def show(self, t, tracks, favoured=()):
         self.fusion.add_tracks(Frame(IMAGE, t), tracks, None, [self.search], favoured)
-        self.search.follow(self.fusion.targets.get(self.followed))
+        self.search.search_for(self.fusion.targets.get(self.followed))
 
     def estimate(self, number, t):
         target = self.fusion.targets.get(number)
@@ -162,7 +162,7 @@ def test_the_followed_and_the_favoured_have_filters_before_others():
     fusion = Pair(BOOK)
     fusion.show(0.0, crowd(range(1, 101)), favoured={90})
     assert known(fusion) == {*range(1, MOST), 90}
-    fusion.search.follow(fusion.fusion.targets[5])
+    fusion.search.search_for(fusion.fusion.targets[5])
     fusion.show(FRAME_S, crowd(range(1, 101), FRAME_S), favoured=set(range(20, 60)))
     assert known(fusion, FRAME_S) == {5, *range(20, 20 + MOST - 1)}
 
@@ -360,7 +360,7 @@ def test_the_zoom_image_is_not_searched_without_a_target_and_a_pose():
     assert fusion.search.add_frame(Frame(IMAGE, 0.0), 0.0) is None  # nothing is followed, no pose is known
     report(fusion, 0.0)
     assert fusion.search.add_frame(Frame(IMAGE, 0.0), 0.0) is None
-    fusion.search.follow(fusion.fusion.targets[1])
+    fusion.search.search_for(fusion.fusion.targets[1])
     assert fusion.search.add_frame(Frame(IMAGE, 0.0), 0.0) is not None
 
 
@@ -368,11 +368,11 @@ def test_another_target_has_another_finder():
     fusion = Pair(BOOK)
     fusion.show(0.0, crowd((1, 2)))
     first, second = fusion.fusion.targets.values()
-    fusion.search.follow(first)
+    fusion.search.search_for(first)
     finder = fusion.search.finder
-    fusion.search.follow(first)
+    fusion.search.search_for(first)
     assert fusion.search.finder is finder
-    fusion.search.follow(second)
+    fusion.search.search_for(second)
     assert fusion.search.finder is not finder
 
 
@@ -452,7 +452,7 @@ def test_a_target_not_found_where_expected_is_reported_and_then_searched_farther
 def test_a_target_of_another_size_is_an_unlikely_candidate(wrong, likely):
     fusion, _, t = followed(Finder(gate=9.0), wrong=wrong, frames=UNFOUND + 30)
     for target in (fusion.fusion.targets[1], None):  # also while it is not followed
-        fusion.search.follow(target)
+        fusion.search.search_for(target)
         (found,) = fusion.candidates(t)
         assert found.likely is likely
 
