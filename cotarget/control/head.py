@@ -165,12 +165,11 @@ class HeadModel:
         seconds = max(t - plan.t, 0.0)
         if command is None:
             return pan, tilt
-        goals, speeds = (command.pan, command.tilt), limits.capped(command.speed)
-        a, b = (
-            axis_at(seconds, x, v, goal, speed, axis.assumed_acceleration)
-            for (x, v), goal, speed, axis in zip((pan, tilt), goals, speeds, limits.axes, strict=True)
+        pan_speed, tilt_speed = limits.capped(command.speed)
+        return (
+            axis_at(seconds, *pan, command.pan, pan_speed, limits.pan.assumed_acceleration),
+            axis_at(seconds, *tilt, command.tilt, tilt_speed, limits.tilt.assumed_acceleration),
         )
-        return a, b
 
 
 def axis_at(seconds: float, x: float, v: float, goal: float, speed: float, acceleration: float) -> tuple[float, float]:
