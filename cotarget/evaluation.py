@@ -18,8 +18,9 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import TargetProfile, split_name
 from cotarget.detection import Detections
 from cotarget.errors import ConfigError, UnreachableError
+from cotarget.estimation.measurement_model import Pose
 from cotarget.estimation.motion_model import GATE
-from cotarget.estimation.zoom_matching import CloseupFinder, Expected, ZoomMeasurement
+from cotarget.estimation.zoom_matching import CloseupFinder, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.pantilt import HeadGeometry
@@ -178,9 +179,9 @@ class TruthFinder:
         """Return True: the ground truth is known at any time."""
         return True
 
-    def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
+    def find(self, frame: Frame, x_fixed: Array, covariance: Array, pose: Pose) -> ZoomMeasurement | None:
         """Find the target; None if its centre is outside the frame or outside the gate."""
-        view, box = self._view(expected), self._truth.box(self._name, "zoom", frame.t)
+        view, box = self._view(x_fixed, covariance, pose), self._truth.box(self._name, "zoom", frame.t)
         if view is None or box is None or self._missed(frame.t):
             return None
         noise = self.SIGMA_PX * self._numbers_at(frame.t).normal(size=2)

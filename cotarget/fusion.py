@@ -18,9 +18,10 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
+from cotarget.estimation.measurement_model import Pose
 from cotarget.estimation.motion_model import GATE, HEAD_SIGMA
 from cotarget.estimation.target_filter import inflated
-from cotarget.estimation.zoom_matching import CloseupFinder, Expected, Finder, MatchingSettings, ZoomMeasurement
+from cotarget.estimation.zoom_matching import CloseupFinder, Finder, MatchingSettings, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image, PanTiltState, ZoomState
 from cotarget.targets import Target
@@ -32,23 +33,6 @@ REMEMBERED_S = 2.0  # longer than any latency [s]
 POINTS = 4
 # Least time between two kept states [s]: a cubic through closer ones multiplies their rounding.
 SPACING_S = 0.01
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Pan, tilt and focal length at one time.
-
-    Attributes:
-        pan: pan as the head reports it [rad].
-        tilt: tilt as the head reports it [rad].
-        nominal_px: nominal focal length, as the lens reports it [px].
-        speed: speed of the head over both axes together [rad/s].
-    """
-
-    pan: float
-    tilt: float
-    nominal_px: float
-    speed: float
 
 
 class StateHistory:
@@ -116,38 +100,6 @@ class FusionSettings:
     contradicted: float = 4.0
     unfound_s: float = 1.5
     just_seen_s: float = 0.2
-
-
-@dataclass(frozen=True)
-class FixedMeasurement:
-    """Measurement of a track by one frame of the fixed camera, for `TargetFilter.add_fixed`.
-
-    Attributes:
-        box: bounding box; the size of a clipped one is only a lower bound.
-        sigma_px: standard deviation of its centre, (2,) [px]; None for that of the settings.
-        size_px: size of the known dimension [px], if it is better known than from this box alone.
-    """
-
-    box: Detection
-    sigma_px: Array | None = None
-    size_px: float | None = None
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the box shows the whole target, and nothing else."""
-        return self.sigma_px is None
-
-
-def measure(track: Track, target: TargetProfile) -> FixedMeasurement:
-    """Derive the measurement from a track's newest detection."""
-    box = track.box
-    if track.shared:  # its box covers other targets too: it bounds the place and shows no size
-        inside = Detection(track.center_px, np.zeros(2), track.score, clipped=True)
-        return FixedMeasurement(inside, np.hypot(room_inside(box.size_px, track.size_px), track.size_px / 2))
-    lacks = missing(track.size_px, box.size_px)
-    if lacks.any():  # a part of the target: no size, and a poor centre
-        return FixedMeasurement(replace(box, clipped=True), np.hypot(lacks, box.size_px) / 2)
-    return FixedMeasurement(box, size_px=track.larger_side_px if target.largest_over_time else None)
 
 
 class ZoomSearch:
@@ -301,8 +253,8 @@ class ZoomSearch:
         if self.is_overdue:
             wider = replace(estimate, state_covariance=inflated(estimate.state_covariance, self._filter))
             searched = wider.appearance(pose.pan, pose.tilt, pose.nominal_px) or seen
-        pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
-        found = self.finder.find(frame, Expected(estimate.x_fixed, searched.covariance, pan, tilt, pose.nominal_px))
+        true = replace(pose, pan=pose.pan + estimate.bias[0], tilt=pose.tilt + estimate.bias[1])
+        found = self.finder.find(frame, estimate.x_fixed, searched.covariance, true)
         self._count_unfound(frame, found, seen, estimate)
         return found
 
@@ -375,12 +327,7 @@ class TargetFusion:
                 continue
             if _was_part(target):
                 target.filter = self._make_filter()
-            measured = measure(target.track, self._profile)
-            if measured.is_whole:
-                for search in searches:
-                    if search.target is target:
-                        measured = self._of_the_body(measured, target.track, search.finder, frame, mask)
-            target.filter.add_fixed(measured.box, frame.t, sigma_px=measured.sigma_px, size_px=measured.size_px)
+            self._measure(target, frame, mask, [search.finder for search in searches if search.target is target])
 
     def _target(self, track: Track) -> Target:
         """Find or make the target of a track."""
@@ -403,18 +350,34 @@ class TargetFusion:
 
         return sorted(self.targets.values(), key=last)[: self._settings.most_filters]
 
-    def _of_the_body(
-        self, measured: FixedMeasurement, track: Track, finder: Finder, frame: Frame, mask: Image | None
-    ) -> FixedMeasurement:
-        """Measure the body point that the zoom image measures too, in place of the box's centre."""
-        fixed_view = finder.store(frame, measured.box, mask)
-        if fixed_view is None:
-            return measured
-        body = replace(measured.box, center_px=fixed_view.body_px)
-        sigma_px = fixed_view.body_sigma_px
-        if self._profile.matcher == "upright":  # a box without the feet has its middle too high
-            sigma_px = np.hypot(sigma_px, [0.0, abs(body.size_px[1] - track.size_px[1]) / 2])
-        return replace(measured, box=body, sigma_px=sigma_px)
+    def _measure(self, target: Target, frame: Frame, mask: Image | None, finders: Sequence[Finder]) -> None:
+        """Add a target's newest detection to its filter.
+
+        Of a followed target, the body point is measured that the zoom image shows too, in place of the box's centre.
+
+        Args:
+            target: target that the frame shows.
+            frame: frame of the fixed camera.
+            mask: foreground of the detector, (H, W).
+            finders: finders of the heads that follow it.
+        """
+        assert target.filter is not None, "who measures has made one"
+        track, box, sigma_px, size_px = target.track, target.track.box, None, None
+        lacks = missing(track.size_px, box.size_px)
+        if track.shared:  # its box covers other targets too: it bounds the place and shows no size
+            sigma_px = np.hypot(room_inside(box.size_px, track.size_px), track.size_px / 2)
+            box = Detection(track.center_px, np.zeros(2), track.score, clipped=True)
+        elif lacks.any():  # a part of the target: no size, and a poor centre
+            sigma_px, box = np.hypot(lacks, box.size_px) / 2, replace(box, clipped=True)
+        else:
+            size_px = track.larger_side_px if self._profile.largest_over_time else None
+            for view in (finder.store(frame, track.box, mask) for finder in finders):
+                if view is None:
+                    continue
+                box, sigma_px = replace(track.box, center_px=view.body_px), view.body_sigma_px
+                if self._profile.matcher == "upright":  # a box without the feet has its middle too high
+                    sigma_px = np.hypot(sigma_px, [0.0, abs(box.size_px[1] - track.size_px[1]) / 2])
+        target.filter.add_fixed(box, frame.t, sigma_px=sigma_px, size_px=size_px)
 
 
 def _was_part(target: Target) -> bool:

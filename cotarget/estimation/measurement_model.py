@@ -6,6 +6,7 @@ floats instead of arrays, because it runs for every frame: that takes less than 
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -26,6 +27,23 @@ from cotarget.estimation.motion_model import (
 from cotarget.geometry import Array
 from cotarget.pantilt import HeadGeometry
 from cotarget.targeting import WantedSize
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pan, tilt and focal length of the zoom camera at one time.
+
+    Attributes:
+        pan: pan as the head reports it [rad].
+        tilt: tilt as the head reports it [rad].
+        nominal_px: nominal focal length, as the lens reports it [px].
+        speed: speed of the head over both axes together [rad/s].
+    """
+
+    pan: float
+    tilt: float
+    nominal_px: float
+    speed: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -119,6 +137,7 @@ class Appearance:
         size_px: apparent size of the target's known dimension [px].
         size_sigma: standard deviation of that size, relative.
         focal_px: true focal lengths (fx, fy), (2,) [px].
+        sides: width and height of its box, relative to that size.
     """
 
     offset_px: Array
@@ -126,11 +145,27 @@ class Appearance:
     size_px: float
     size_sigma: float
     focal_px: Array
+    sides: tuple[float, float] = (1.0, 1.0)
 
     @property
     def sigma_px(self) -> Array:
         """Standard deviations of the offset, (2,) [px]."""
         return np.sqrt(np.diag(self.covariance))
+
+    @cached_property
+    def offset(self) -> Array:
+        """Offset from the image's centre, right and down, (2,) [tangent]."""
+        return self.offset_px / self.focal_px
+
+    @cached_property
+    def variance(self) -> Array:
+        """Variances of the offset, (2,) [tangent^2]."""
+        return np.diag(self.covariance) / (self.focal_px * self.focal_px)
+
+    @cached_property
+    def half(self) -> Array:
+        """Half of the width and height, (2,) [tangent]."""
+        return 0.5 * self.size_px / self.focal_px * np.array(self.sides)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,13 +229,14 @@ class Estimate:
         apparent = self.target.size * math.exp(self.state[LOG_SIZE] + self.state[LOG_APPARENT])
         return WantedSize(apparent, self.target.wanted_px, self.target.is_vertical())
 
-    def appearance(self, pan: float, tilt: float, nominal_px: float) -> Appearance | None:
+    def appearance(self, pan: float, tilt: float, nominal_px: float, shape: float = 1.0) -> Appearance | None:
         """Predict where and how large the target appears in the zoom image, head bias included.
 
         Args:
             pan: reported pan [rad].
             tilt: reported tilt [rad].
             nominal_px: nominal focal length [px].
+            shape: width over height of the target's box.
 
         Returns:
             The appearance; None if the target is behind the zoom camera.
@@ -220,4 +256,5 @@ class Estimate:
             size_px=size * float(focal[int(self.target.is_vertical())]),
             size_sigma=math.sqrt(max(float(OF_SIZE @ P @ OF_SIZE), 0.0)),
             focal_px=focal,
+            sides=self.target.sides(shape),
         )

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.estimation.correlation import Samples, correlate, resample, summit
+from cotarget.estimation.measurement_model import Pose
 from cotarget.estimation.motion_model import GATE
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image
@@ -226,52 +227,60 @@ class ZoomView:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Best place of a search.
+class ZoomMeasurement:
+    """Measurement of the body's centre in a zoom image, by registration.
 
     Attributes:
-        center_px: body's centre in the zoom image (u, v), (2,).
-        score: normalised correlation, -1 to 1.
-        lead: score less that of the next best place.
-        sigma_px: standard deviation of the place along u and v each [px].
+        center_px: the centre in the zoom image (u, v), (2,).
+        sigma_px: standard deviation against the same point in the fixed image, along u and v each [px].
+        body_sigma_px: standard deviation of that point against the body's true centre, along u and v, (2,) [px].
+        t: exposure time of the zoom frame [s].
     """
 
     center_px: Array
-    score: float
-    lead: float
     sigma_px: float
+    body_sigma_px: Array
+    t: float
 
 
-def register(image: Image, fixed_view: FixedView, view: ZoomView, settings: MatchingSettings) -> Place | None:
-    """Find a target's cut-out in a zoom image, first coarsely, then finely.
+def register(frame: Frame, fixed_view: FixedView, view: ZoomView, settings: MatchingSettings) -> ZoomMeasurement | None:
+    """Find a target's cut-out in a zoom frame, first coarsely, then finely.
 
     Args:
-        image: zoom image, (H, W, 3) BGR.
+        frame: frame of the zoom camera.
         fixed_view: the target in the fixed image.
         view: mapping from the fixed to the zoom image.
         settings: settings of the registration.
 
     Returns:
-        The place; None if nothing correlates, if two places do, or if the maximum lies beyond the gate.
+        The measurement; None if nothing correlates, if two places do, or if the maximum lies beyond the gate.
     """
     coarse, fine = (
         max(fixed_view.side_px / samples, 1 / view.scale)
         for samples in (settings.coarse_samples, settings.fine_samples)
     )
-    place = _search(image, fixed_view, view, coarse, None, settings)
-    if place is None or place.lead < settings.least_lead:
+    center_px = _search(frame.image, fixed_view, view, coarse, None, settings)
+    if center_px is None:
         return None
-    return _search(
-        image, fixed_view, replace(view, center_px=place.center_px), fine, math.ceil(coarse / fine / 2), settings
+    near, reach = replace(view, center_px=center_px), math.ceil(coarse / fine / 2)
+    center_px = _search(frame.image, fixed_view, near, fine, reach, settings)
+    if center_px is None:
+        return None
+    return ZoomMeasurement(
+        center_px=center_px,
+        sigma_px=settings.sigma_px * (1 + fine) * view.scale,
+        body_sigma_px=np.abs(view.J) @ fixed_view.body_sigma_px,
+        t=frame.t,
     )
 
 
 def _search(
     image: Image, fixed_view: FixedView, view: ZoomView, pitch: float, reach: int | None, settings: MatchingSettings
-) -> Place | None:
-    """Find the place of highest correlation with a cut-out sampled every ``pitch`` fixed pixels.
+) -> Array | None:
+    """Find the place of highest correlation with a cut-out sampled every ``pitch`` fixed pixels, (2,) [px].
 
-    The search covers ``reach`` samples to each side of the view's centre, or all samples inside the gate if it is None.
+    The search covers ``reach`` samples to each side of the view's centre, and the place must correlate well. If it is
+    None, the search covers all samples inside the gate, and the place must lead the next best one.
     """
     template, weight, middle = fixed_view.at_pitch(pitch)
     step = view.J * pitch  # zoom pixels per sample
@@ -299,54 +308,18 @@ def _search(
     top = summit(likeness, (row, column))
     if not allowed[row, column] or top is None:
         return None
-    # Places whose boxes overlap are one place.
-    apart = fixed_view.size_px / pitch
-    low = np.maximum(np.ceil([column - apart[0], row - apart[1]]), 0).astype(int)
-    high = np.floor([column + apart[0], row + apart[1]]).astype(int) + 1
-    score[low[1] : high[1], low[0] : high[0]] = -1.0
     best = float(likeness[row, column])
-    return Place(
-        center_px=first_px + step @ (middle + top),
-        score=best,
-        lead=best - max(float(score.max()), 0.0),
-        sigma_px=settings.sigma_px * (1 + pitch) * view.scale,
-    )
-
-
-@dataclass(frozen=True)
-class Expected:
-    """Expected position of the target at a zoom frame's time, with the zoom camera's state then.
-
-    Attributes:
-        x_fixed: target position [m], (3,).
-        covariance: covariance of its place in the zoom image [px^2], (2, 2).
-        pan: reported pan plus its estimated bias [rad].
-        tilt: reported tilt plus its estimated bias [rad].
-        nominal_px: nominal focal length [px].
-    """
-
-    x_fixed: Array
-    covariance: Array
-    pan: float
-    tilt: float
-    nominal_px: float
-
-
-@dataclass(frozen=True)
-class ZoomMeasurement:
-    """Measurement of the body's centre in a zoom image, by registration.
-
-    Attributes:
-        center_px: the centre in the zoom image (u, v), (2,).
-        sigma_px: standard deviation against the same point in the fixed image, along u and v each [px].
-        body_sigma_px: standard deviation of that point against the body's true centre, along u and v, (2,) [px].
-        t: exposure time of the zoom frame [s].
-    """
-
-    center_px: Array
-    sigma_px: float
-    body_sigma_px: Array
-    t: float
+    if reach is None:
+        # Places whose boxes overlap are one place.
+        apart = fixed_view.size_px / pitch
+        low = np.maximum(np.ceil([column - apart[0], row - apart[1]]), 0).astype(int)
+        high = np.floor([column + apart[0], row + apart[1]]).astype(int) + 1
+        score[low[1] : high[1], low[0] : high[0]] = -1.0
+        if best - max(float(score.max()), 0.0) < settings.least_lead:
+            return None
+    elif best < settings.least_score:
+        return None
+    return np.asarray(first_px + step @ (middle + top))
 
 
 class Finder(Protocol):
@@ -358,7 +331,7 @@ class Finder(Protocol):
     def fixed_view_at(self, t: float) -> object | None:
         """Return the stored cut-out nearest to time t [s]; None if none is near enough."""
 
-    def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
+    def find(self, frame: Frame, x_fixed: Array, covariance: Array, pose: Pose) -> ZoomMeasurement | None:
         """Find the target in a zoom frame."""
 
 
@@ -410,38 +383,29 @@ class CloseupFinder:
                 near, apart_s = fixed_view, abs(fixed_view.t - t)
         return near
 
-    def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
+    def find(self, frame: Frame, x_fixed: Array, covariance: Array, pose: Pose) -> ZoomMeasurement | None:
         """Find the target in a zoom frame.
 
         Args:
             frame: frame of the zoom camera.
-            expected: expected position of the target.
+            x_fixed: expected position of the target [m], (3,).
+            covariance: covariance of its place in the zoom image [px^2], (2, 2).
+            pose: head and lens at the frame's time; the angles are the reported ones plus their estimated bias.
 
         Returns:
             The measurement; None if the target is not found, or not with certainty.
         """
-        fixed_view, view = self.fixed_view_at(frame.t), self.view(expected)
-        if fixed_view is None or view is None:
-            return None
-        place = register(frame.image, fixed_view, view, self._settings)
-        if place is None or place.score < self._settings.least_score:
-            return None
-        return ZoomMeasurement(
-            center_px=place.center_px,
-            sigma_px=place.sigma_px,
-            body_sigma_px=np.abs(view.J) @ fixed_view.body_sigma_px,
-            t=frame.t,
-        )
+        fixed_view, view = self.fixed_view_at(frame.t), self.view(x_fixed, covariance, pose)
+        return None if fixed_view is None or view is None else register(frame, fixed_view, view, self._settings)
 
-    def view(self, expected: Expected) -> ZoomView | None:
+    def view(self, x_fixed: Array, covariance: Array, pose: Pose) -> ZoomView | None:
         """Map the surroundings of the target to the zoom image; None behind a camera or outside its lens model."""
-        x, covariance = np.asarray(expected.x_fixed, dtype=float), np.asarray(expected.covariance, dtype=float)
+        x, covariance = np.asarray(x_fixed, dtype=float), np.asarray(covariance, dtype=float)
         if not (np.isfinite(x).all() and np.isfinite(covariance).all() and x[2] > 0):
             return None
         # A small cross at the target, parallel to the fixed image plane, for numerical derivatives.
         cross = x + STEP * x[2] * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
-        head = self._calibration.zoom_head
-        zoom = head.project(cross, expected.pan, expected.tilt, expected.nominal_px)
+        zoom = self._calibration.zoom_head.project(cross, pose.pan, pose.tilt, pose.nominal_px)
         fixed = self._calibration.fixed.project(cross)
         if not (np.isfinite(zoom).all() and np.isfinite(fixed).all()):
             return None

@@ -11,7 +11,8 @@ from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.demo import SCENES, sim_config
-from cotarget.estimation.zoom_matching import CloseupFinder, Expected, look
+from cotarget.estimation.measurement_model import Pose
+from cotarget.estimation.zoom_matching import CloseupFinder, look
 from cotarget.evaluation import true_calibration
 from cotarget.geometry import pose
 from cotarget.rig import Detection, Frame
@@ -100,10 +101,10 @@ class Scene:
         return Frame(self.draw(self.zoom_px, self.nominal / FOCAL, which), t)
 
     def expected(self, off_px=(0.0, 0.0), sigma_px=SIGMA_PX):
-        """Return the expected position, wrong by `off_px` in the zoom image."""
+        """Return the expected position, its covariance and the pose, wrong by `off_px` in the zoom image."""
         depth = self.birds[0][2]
         x = self.birds[0] + np.array([*off_px, 0.0]) * depth / self.nominal
-        return Expected(x, sigma_px**2 * np.eye(2), self.pan, self.tilt, self.nominal)
+        return x, sigma_px**2 * np.eye(2), Pose(self.pan, self.tilt, self.nominal)
 
     def finder(self):
         finder = CloseupFinder(self.calibration, BIRD)
@@ -122,7 +123,7 @@ class Scene:
 @pytest.mark.parametrize("roll_deg", [0.0, 8.0])
 def test_a_target_is_registered_at_any_focal_length_and_roll(nominal, roll_deg):
     scene = Scene([(1.5, -1.0, 20.0)], nominal, roll_deg)
-    found = scene.finder().find(scene.zoom(), scene.expected((15.0, -10.0)))
+    found = scene.finder().find(scene.zoom(), *scene.expected((15.0, -10.0)))
     assert found is not None
     error = scene.error(found)
     assert error < REGISTERED_PX
@@ -134,22 +135,22 @@ def test_a_target_is_registered_at_any_focal_length_and_roll(nominal, roll_deg):
 def test_nothing_is_found_in_an_empty_zoom_image():
     for seed in range(8):
         scene = Scene([(1.5, -1.0, 20.0)], seed=seed)
-        assert scene.finder().find(scene.zoom(which=[]), scene.expected()) is None
+        assert scene.finder().find(scene.zoom(which=[]), *scene.expected()) is None
 
 
 def test_a_target_outside_the_gate_is_not_found():
     scene = Scene([(1.5, -1.0, 20.0)])
     finder, zoom = scene.finder(), scene.zoom()
-    assert finder.find(zoom, scene.expected((100.0, 0.0), sigma_px=10.0)) is None
-    assert finder.find(zoom, scene.expected((100.0, 0.0), sigma_px=40.0)) is not None
+    assert finder.find(zoom, *scene.expected((100.0, 0.0), sigma_px=10.0)) is None
+    assert finder.find(zoom, *scene.expected((100.0, 0.0), sigma_px=40.0)) is not None
 
 
 def test_two_equal_targets_in_the_gate_are_ambiguous():
     scene = Scene([(1.5, -1.0, 20.0), (2.1, -1.0, 20.0)])  # 0.6 m at 20 m and 3000 px: 90 px
     finder, zoom = scene.finder(), scene.zoom()
     halfway = scene.expected((45.0, 0.0), sigma_px=40.0)
-    assert finder.find(zoom, halfway) is None
-    sure = finder.find(zoom, scene.expected((5.0, 0.0), sigma_px=15.0))
+    assert finder.find(zoom, *halfway) is None
+    sure = finder.find(zoom, *scene.expected((5.0, 0.0), sigma_px=15.0))
     assert sure is not None
     assert scene.error(sure) < REGISTERED_PX
 
@@ -157,7 +158,7 @@ def test_two_equal_targets_in_the_gate_are_ambiguous():
 def test_a_target_clipped_by_the_zoom_image_is_found_while_most_of_it_shows():
     for off, found_there in ((0.0, True), (300.0, True), (-290.0, True), (360.0, False), (420.0, False)):
         scene = Scene([(1.5, -1.0, 20.0)], aim_off_px=(off, 0.0))
-        found = scene.finder().find(scene.zoom(), scene.expected((10.0, 5.0)))
+        found = scene.finder().find(scene.zoom(), *scene.expected((10.0, 5.0)))
         assert (found is not None) == found_there, off
         if found is not None:
             assert scene.error(found) < 2 * REGISTERED_PX
@@ -168,7 +169,8 @@ def test_a_zoom_stream_of_half_the_size_is_registered():
     half = Frame(cv2.resize(scene.zoom().image, (320, 240), interpolation=cv2.INTER_AREA), 0.0)
     finder = CloseupFinder(scene.calibration.for_streams(SIZE, (320, 240)), BIRD)
     finder.store(*scene.fixed())
-    found = finder.find(half, dataclasses.replace(scene.expected(), nominal_px=scene.nominal / 2))
+    x, covariance, there = scene.expected()
+    found = finder.find(half, x, covariance, dataclasses.replace(there, nominal_px=scene.nominal / 2))
     assert found is not None
     doubled = dataclasses.replace(found, center_px=(found.center_px + 0.5) * 2 - 0.5)
     assert scene.error(doubled) < REGISTERED_PX
@@ -178,7 +180,7 @@ def test_a_zoom_stream_of_half_the_size_is_registered():
 def test_the_cameras_may_be_exposed_differently(gain, offset):
     scene = Scene([(1.5, -1.0, 20.0)])
     image = np.clip(scene.zoom().image * gain + offset, 0, 255).astype(np.uint8)
-    found = scene.finder().find(Frame(image, 0.0), scene.expected())
+    found = scene.finder().find(Frame(image, 0.0), *scene.expected())
     assert found is not None
     assert scene.error(found) < REGISTERED_PX
 
@@ -188,13 +190,13 @@ def test_the_fixed_frame_nearest_in_time_is_registered_and_an_old_one_is_not():
     frame, detection, mask = scene.fixed()
     finder = CloseupFinder(scene.calibration, BIRD)
     zoom = scene.zoom(t=1.0)
-    assert finder.find(zoom, scene.expected()) is None
+    assert finder.find(zoom, *scene.expected()) is None
     for t in (0.8, 0.94, 0.98, 1.03):
         finder.store(Frame(frame.image, t), detection, mask)
     assert finder.fixed_view_at(1.0).t == 0.98
-    assert finder.find(zoom, scene.expected()).t == 1.0
+    assert finder.find(zoom, *scene.expected()).t == 1.0
     assert finder.fixed_view_at(1.2) is None
-    assert finder.find(Frame(zoom.image, 1.2), scene.expected()) is None
+    assert finder.find(Frame(zoom.image, 1.2), *scene.expected()) is None
 
 
 def test_a_target_without_foreground_is_registered_by_its_box():
@@ -203,7 +205,7 @@ def test_a_target_without_foreground_is_registered_by_its_box():
     for nothing in (None, np.zeros_like(mask)):
         finder = CloseupFinder(scene.calibration, BIRD)
         finder.store(frame, detection, nothing)
-        found = finder.find(scene.zoom(), scene.expected())
+        found = finder.find(scene.zoom(), *scene.expected())
         assert found is not None
         assert scene.error(found, finder) < REGISTERED_PX
 
@@ -215,7 +217,7 @@ def test_a_clipped_box_has_an_uncertain_body_centre():
     for clipped in (False, True):
         finder = CloseupFinder(scene.calibration, BIRD)
         finder.store(frame, dataclasses.replace(detection, clipped=clipped), mask)
-        sigmas.append(finder.find(scene.zoom(), scene.expected()).body_sigma_px)
+        sigmas.append(finder.find(scene.zoom(), *scene.expected()).body_sigma_px)
     assert (sigmas[1] > 0.45 * detection.size_px * scene.nominal / FOCAL).all()
     assert (sigmas[1] > 2 * sigmas[0]).all()
 
@@ -223,8 +225,8 @@ def test_a_clipped_box_has_an_uncertain_body_centre():
 @pytest.mark.parametrize("x", [(0.0, 0.0, -20.0), (0.0, 0.0, 0.0), (math.nan, 0.0, 20.0), (90.0, 0.0, 20.0)])
 def test_a_target_that_a_camera_cannot_show_is_not_found(x):
     scene = Scene([(1.5, -1.0, 20.0)])
-    expected = dataclasses.replace(scene.expected(), x_fixed=np.array(x))
-    assert scene.finder().find(scene.zoom(), expected) is None
+    _, covariance, there = scene.expected()
+    assert scene.finder().find(scene.zoom(), np.array(x), covariance, there) is None
 
 
 @pytest.mark.parametrize("center", [(-30.0, 100.0), (700.0, 100.0), (math.nan, 100.0), (0.0, 0.0), (639.0, 479.0)])
@@ -233,7 +235,7 @@ def test_boxes_at_and_beyond_the_border_are_not_registered(center):
     frame, detection, mask = scene.fixed()
     finder = CloseupFinder(scene.calibration, BIRD)
     finder.store(frame, dataclasses.replace(detection, center_px=np.array(center)), mask)
-    assert finder.find(scene.zoom(), scene.expected()) is None
+    assert finder.find(scene.zoom(), *scene.expected()) is None
 
 
 # ---------------------------------------------------------------- rendered scenes
@@ -272,7 +274,7 @@ def test_rendered_targets_are_registered_from_the_shortest_focal_length_to_the_l
         fixed_view = finder.store(fixed, box, mask)
         # The expected depth is wrong by a twentieth.
         head, lens = truth.head_at(t), truth.nominal_at(t)
-        found = finder.find(zoom, Expected(x_fixed * 1.05, 30.0**2 * np.eye(2), *head, lens))
+        found = finder.find(zoom, x_fixed * 1.05, 30.0**2 * np.eye(2), Pose(*head, lens))
         assert found is not None, f"at {nominal:.0f} px"
         scale = truth.lens("zoom", t).focal_px[0] / truth.lens("fixed", t).focal_px[0]
         error = (found.center_px - truth.pixel("zoom", truth.center(name, t), t)) / scale

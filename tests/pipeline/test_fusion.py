@@ -188,13 +188,11 @@ class Finder:
     def fixed_view_at(self, t):
         return "a view"
 
-    def find(self, frame, expected):
-        self.asked.append(expected)
+    def find(self, frame, x_fixed, covariance, pose):
+        self.asked.append((x_fixed, pose))
         # The head looks straight ahead.
-        center, there = (
-            np.array(CENTER) + ZOOMED * (x[:2] - (BASELINE, 0.0)) / x[2] for x in (self.x, expected.x_fixed)
-        )
-        if (center - there) @ np.linalg.solve(expected.covariance, center - there) > self.gate:
+        center, there = (np.array(CENTER) + ZOOMED * (x[:2] - (BASELINE, 0.0)) / x[2] for x in (self.x, x_fixed))
+        if (center - there) @ np.linalg.solve(covariance, center - there) > self.gate:
             return None
         body_sigma_px = np.full(2, self.body_sigma_px)
         return ZoomMeasurement(center + self.off_px, 1.0, body_sigma_px, frame.t)
@@ -333,8 +331,8 @@ def test_the_zoom_image_triangulates_the_depth():
     assert alone.estimate(1, t).depth == pytest.approx(10.0 / 1.03, rel=0.01)
     # A book's size is taken to be known to 1 %, the head's pan to 0.03 degrees, which is 1.2 % of this depth.
     assert both.estimate(1, t).depth == pytest.approx(10.0, rel=DEPTH)
-    assert finder.asked[-1].nominal_px == pytest.approx(ZOOMED)
-    assert finder.asked[-1].x_fixed[2] == pytest.approx(10.0, rel=DEPTH)
+    assert finder.asked[-1][1].nominal_px == pytest.approx(ZOOMED)
+    assert finder.asked[-1][0][2] == pytest.approx(10.0, rel=DEPTH)
 
 
 @pytest.mark.parametrize(("body_sigma_px", "shake"), [(30.0, 0.0), (1.0, 0.05)], ids=["moving limbs", "moving head"])
@@ -349,7 +347,7 @@ def test_the_zoom_image_is_searched_at_the_heads_angles_plus_their_bias():
     """The size of a book and the depth that it gives are known well enough to find most of the bias."""
     bias = 1e-3, 1.5e-3
     fusion, _, t = followed(finder := Finder(bias=bias))
-    asked = finder.asked[-1].pan, finder.asked[-1].tilt
+    asked = finder.asked[-1][1].pan, finder.asked[-1][1].tilt
     np.testing.assert_allclose(fusion.estimate(1, t).bias, bias, rtol=0.5)
     np.testing.assert_allclose(asked, bias, rtol=0.5)
 
@@ -479,7 +477,7 @@ class Ahead(CloseupFinder):
         super().__init__(CALIBRATION, BOOK)
         self.asked = []
 
-    def find(self, frame, expected):
+    def find(self, frame, x_fixed, covariance, pose):
         self.asked.append(frame.t)
         return ZoomMeasurement(np.array(CENTER), 1.0, np.ones(2), frame.t)
 
