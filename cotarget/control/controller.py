@@ -7,13 +7,12 @@ probability that the target stays in the image (`cotarget.control.zoom`).
 import dataclasses
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.control.head import HeadController, HeadSettings
-from cotarget.control.zoom import ZoomController, ZoomSettings, expect
+from cotarget.control.zoom import ZoomController, ZoomSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
 from cotarget.rig import PanTiltState, Rig
@@ -21,25 +20,6 @@ from cotarget.targeting import Aim, Reach, aim
 
 NO_CHANGE = 1e-6  # least change of the logarithm of the focal length that is commanded
 Predict = Callable[[float], Estimate | None]
-
-
-@dataclass(frozen=True)
-class _Course:
-    """Wanted motion of the head, predicted over the lead.
-
-    Attributes:
-        effect_t: time at which a command given now takes effect [s].
-        lead_s: time from the last measurement to ``effect_t`` [s].
-        target: estimate of the target at that time.
-        first: aim at it.
-        then: aim one frame later, at the same focal length.
-    """
-
-    effect_t: float
-    lead_s: float
-    target: Estimate
-    first: Aim
-    then: Aim
 
 
 class Controller:
@@ -87,16 +67,17 @@ class Controller:
         Raises:
             UnreachableError: no pan and tilt within the limits do it, or there is no estimate yet.
         """
-        course = self._course(predict, seen_t, interval)
-        self._command_head(course, interval)
+        effect_t, target, later = self._predict_over_lead(predict, seen_t, interval)
+        first, then = self._aims(target, later)
+        self._command_head(effect_t, target, first, then, interval)
         pan, tilt, focal = self.commanded
         now = self._rig.clock.now()
         exposed = interval + (now + self._rig.spec.zoom.delay_s)
         (pan_then, _), (tilt_then, _) = self._head_controller.head.motion_at(exposed)
-        then = predict(exposed if self._predict else seen_t)
+        at_exposure = predict(exposed if self._predict else seen_t)
         focal_px, reason = self._zoom.choose(
-            None if then is None else expect(then, pan_then, tilt_then, focal, shape=shape),
-            course.first.focal_px * course.then.range / course.first.range,
+            None if at_exposure is None else at_exposure.appearance(pan_then, tilt_then, focal, shape),
+            first.focal_px * then.range / first.range,
             self._true(focal),
             now,
             self._true(self._rig.zoom.state().focal_px),
@@ -106,7 +87,7 @@ class Controller:
             focal = self._rig.zoom.zoom(nominal)
             self.lens_commands += 1
         self.commanded = (pan, tilt, focal)
-        return course.first, reason
+        return first, reason
 
     def search(self, predict: Predict, seen_t: float, interval: float) -> Aim | None:
         """Zoom out, and point the head where a target out of sight should be.
@@ -124,40 +105,60 @@ class Controller:
             UnreachableError: no pan and tilt within the limits do it, or there is no estimate yet.
         """
         self.zoom_out()
-        course = self._course(predict, seen_t, interval)
-        seen = course.target.appearance(course.first.pan, course.first.tilt, self._rig.zoom.focal_range[0])
+        effect_t, target, later = self._predict_over_lead(predict, seen_t, interval)
+        first, then = self._aims(target, later)
+        seen = target.appearance(first.pan, first.tilt, self._rig.zoom.focal_range[0])
         if seen is None or (seen.sigma_px > np.array(self._rig.zoom.size) / 2).any():
             return None
-        self._command_head(course, interval)
-        return course.first
+        self._command_head(effect_t, target, first, then, interval)
+        return first
 
-    def _course(self, predict: Predict, seen_t: float, interval: float) -> _Course:
-        """Predict the target over the lead, and compute the wanted motion of the head. Raises as `drive` does."""
-        now = self._rig.clock.now()
-        effect = now + self._rig.spec.head.delay_s
-        times = (effect, effect + interval) if self._predict else (seen_t, seen_t)
-        at_effect, then = (predict(t) for t in times)
-        if at_effect is None or then is None:
+    def _predict_over_lead(self, predict: Predict, seen_t: float, interval: float) -> tuple[float, Estimate, Estimate]:
+        """Predict the target over the lead: to when a command given now takes effect, and one frame further.
+
+        Returns:
+            The time at which a command given now takes effect [s]; the estimates at that time and one frame later.
+
+        Raises:
+            UnreachableError: there is no estimate yet.
+        """
+        effect_t = self._rig.clock.now() + self._rig.spec.head.delay_s
+        times = (effect_t, effect_t + interval) if self._predict else (seen_t, seen_t)
+        target, later = (predict(t) for t in times)
+        if target is None or later is None:
             raise UnreachableError("where the target is was not seen yet")
+        return effect_t, target, later
+
+    def _aims(self, target: Estimate, later: Estimate) -> tuple[Aim, Aim]:
+        """Aim at a target when a command takes effect, and one frame later at the same focal length.
+
+        Raises:
+            UnreachableError: no pan and tilt within the limits do it.
+        """
         state = self._rig.head.state()
         self._head_controller.head.add_report(state)  # a halted or slow head is not where it was sent
         reach = reach_of(self._rig, state)
-        first = self._aim(at_effect, reach)
-        lead_s = effect - at_effect.measured_t
-        return _Course(effect, lead_s, at_effect, first, self._aim(then, reach, first))
+        first = self._aim(target, reach)
+        return first, self._aim(later, reach, first)
 
-    def _command_head(self, course: _Course, interval: float) -> None:
-        """Send the head unless it is held."""
-        effect, first, then = course.effect_t, course.first, course.then
-        rates = (then.pan - first.pan) / interval, (then.tilt - first.tilt) / interval
+    def _command_head(self, effect_t: float, target: Estimate, first: Aim, then: Aim, interval: float) -> None:
+        """Send the head unless it is held.
+
+        Args:
+            effect_t: time at which a command given now takes effect [s].
+            target: estimate of the target at that time.
+            first: aim at ``effect_t``.
+            then: aim one frame later.
+            interval: time from one command to the next [s].
+        """
         pan, tilt, focal = self.commanded
         command = self._head_controller.decide(
-            effect,
+            effect_t,
             interval,
             (first.pan, first.tilt),
-            rates,
+            ((then.pan - first.pan) / interval, (then.tilt - first.tilt) / interval),
             self._rig.zoom.size[0] / self._true(focal),
-            course.lead_s,
+            effect_t - target.measured_t,
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)

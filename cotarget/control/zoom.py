@@ -11,12 +11,10 @@ are true ones [px].
 import math
 from dataclasses import dataclass
 
-import numpy as np
 from scipy.optimize import brentq
 
 from cotarget.config import GOOD_SIZE
 from cotarget.estimation.measurement_model import Appearance, Estimate
-from cotarget.geometry import Array
 from cotarget.tracking.track import Track
 
 # Probability that the whole target is in the image: below it the lens zooms out, from it on the target is seen well.
@@ -41,56 +39,10 @@ class ZoomSettings:
     settle_s: float = 0.3
 
 
-@dataclass(frozen=True)
-class ExpectedTarget:
-    """Predicted place and size of the target in the next zoom frame.
-
-    Attributes:
-        offset: offset of its centre from the image's centre, right and down [tangent], (2,).
-        covariance: covariance of the offset [tangent^2], (2, 2).
-        half: half its width and height [tangent], (2,).
-        size_sigma: relative standard deviation of the size.
-    """
-
-    offset: Array
-    covariance: Array
-    half: Array
-    size_sigma: float = 0.0
-
-
 def shape_of(track: Track) -> float:
     """Width over height of a track's usual box."""
     width, height = track.size_px.tolist()
     return float(width / height)
-
-
-def expect(
-    estimate: Estimate, pan: float, tilt: float, nominal_px: float, *, shape: float = 1.0
-) -> ExpectedTarget | None:
-    """Predict the target in the zoom image.
-
-    Args:
-        estimate: estimate of the target at the next zoom frame's exposure.
-        pan: pan of the head then [rad].
-        tilt: tilt of the head then [rad].
-        nominal_px: any focal length near the one in question; it only affects the principal point.
-        shape: width over height of the target's box.
-
-    Returns:
-        The prediction; None if the target will be behind the zoom camera.
-    """
-    seen = estimate.appearance(pan, tilt, nominal_px)
-    return None if seen is None else _expected(estimate, seen, shape)
-
-
-def _expected(estimate: Estimate, seen: Appearance, shape: float) -> ExpectedTarget:
-    focal = seen.focal_px
-    return ExpectedTarget(
-        seen.offset_px / focal,
-        seen.covariance / (focal[:, None] * focal),
-        0.5 * seen.size_px / focal * np.array(estimate.target.sides(shape)),
-        seen.size_sigma,
-    )
 
 
 def is_seen_well(
@@ -106,38 +58,37 @@ def is_seen_well(
         longest_px: longest nominal focal length [px]; it limits the size wanted of a far target.
         shape: width over height of the target's box.
     """
-    seen = estimate.appearance(pan, tilt, nominal_px)
+    seen = estimate.appearance(pan, tilt, nominal_px, shape)
     if seen is None:
         return False
     zoom, focal = estimate.calibration.zoom_head.lens, float(seen.focal_px[0])
     wanted_px = min(estimate.target.wanted_px, seen.size_px * zoom.at(longest_px).focal_px[0] / focal)
     if not GOOD_SIZE[0] * wanted_px <= seen.size_px <= GOOD_SIZE[1] * wanted_px:
         return False
-    return chance_inside(_expected(estimate, seen, shape), focal, zoom.size) >= LIKELY
+    return chance_inside(seen, focal, zoom.size) >= LIKELY
 
 
-def chance_inside(expected: ExpectedTarget, focal_px: float, size: tuple[int, int], rim_px: float = 0.0) -> float:
-    """Probability that the whole target is in the image.
+def chance_inside(seen: Appearance, focal_px: float, size: tuple[int, int], rim_px: float = 0.0) -> float:
+    """Probability that the whole target is in the image at a focal length.
 
     Args:
-        expected: predicted target; the uncertainty of its size widens each side, and the axes are independent.
+        seen: predicted target; the uncertainty of its size widens each side, and the axes are independent.
         focal_px: focal length [px].
         size: (width, height) of the image [px].
         rim_px: margin at the border that does not count as image [px].
     """
     chance = 1.0
     for axis in range(2):
-        room = (size[axis] / 2 - rim_px) / focal_px - float(expected.half[axis])
-        sigma = math.hypot(
-            math.sqrt(float(expected.covariance[axis, axis])), float(expected.half[axis]) * expected.size_sigma
-        )
-        offset = abs(float(expected.offset[axis]))
+        half, variance = float(seen.half[axis]), float(seen.variance[axis])
+        room = (size[axis] / 2 - rim_px) / focal_px - half
+        sigma = math.hypot(math.sqrt(variance), half * seen.size_sigma)
+        offset = abs(float(seen.offset[axis]))
         chance *= max(_below(room - offset, sigma) - _below(-room - offset, sigma), 0.0) if room > 0 else 0.0
     return chance
 
 
 def longest_focal(
-    expected: ExpectedTarget,
+    seen: Appearance,
     chance: float,
     size: tuple[int, int],
     focal_range: tuple[float, float],
@@ -146,7 +97,7 @@ def longest_focal(
     """Find the longest focal length at which the whole target is in the image with a given probability.
 
     Args:
-        expected: predicted target.
+        seen: predicted target.
         chance: probability, 0 to 1.
         size: (width, height) of the image [px].
         focal_range: shortest and longest focal length [px]; the shortest is returned even if it does not suffice.
@@ -154,7 +105,7 @@ def longest_focal(
     """
 
     def excess(focal_px: float) -> float:
-        return chance_inside(expected, focal_px, size, rim_px) - chance
+        return chance_inside(seen, focal_px, size, rim_px) - chance
 
     shortest, longest = focal_range
     if excess(longest) >= 0:
@@ -182,7 +133,7 @@ class ZoomController:
 
     def choose(
         self,
-        expected: ExpectedTarget | None,
+        seen: Appearance | None,
         wanted_px: float,
         commanded_px: float,
         t: float,
@@ -191,7 +142,7 @@ class ZoomController:
         """Decide on the focal length.
 
         Args:
-            expected: predicted target; None if it is lost.
+            seen: the target as predicted for the next zoom frame, at any focal length; None if it is lost.
             wanted_px: focal length at which the target has the wanted size [px].
             commanded_px: focal length commanded last [px].
             t: time now [s].
@@ -200,12 +151,12 @@ class ZoomController:
         Returns:
             The focal length [px], and the reason: "wanted", "unsure", "about to be lost", "settling" or "lost".
         """
-        if expected is None:
+        if seen is None:
             self._out_t = t
             return self._range[0], "lost"
         settings, size = self._settings, self._size
         wanted = min(max(wanted_px, self._range[0]), self._range[1])
-        sure = longest_focal(expected, settings.sure, size, self._range, settings.rim_px)
+        sure = longest_focal(seen, settings.sure, size, self._range, settings.rim_px)
         goal = min(wanted, sure)
         reason = "wanted" if wanted <= sure else "unsure"
         change = math.log(goal / commanded_px)
@@ -215,7 +166,7 @@ class ZoomController:
                 here = commanded_px if now_px is None else now_px
                 return max(commanded_px, min(goal, here)), "settling"
             return goal, reason
-        if change < 0 and commanded_px > longest_focal(expected, LIKELY, size, self._range, settings.rim_px):
+        if change < 0 and commanded_px > longest_focal(seen, LIKELY, size, self._range, settings.rim_px):
             self._out_t = t
             return goal, "about to be lost"
         if math.log(wanted / commanded_px) < -settings.deadband:

@@ -19,10 +19,10 @@ from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.control.controller import NO_CHANGE
 from cotarget.control.head import HeadController
-from cotarget.control.zoom import ExpectedTarget, ZoomController
+from cotarget.control.zoom import ZoomController
 from cotarget.detection import Detector
 from cotarget.errors import UnreachableError
-from cotarget.estimation.motion_model import filter_settings
+from cotarget.estimation import Appearance, filter_settings
 from cotarget.geometry import Array
 from cotarget.pantilt import base_head, nearest, solve
 from cotarget.rig import Angles, Detection, Frame, Rig
@@ -251,17 +251,19 @@ class LoneCamera:
         (pan, tilt), (pan_variance, tilt_variance) = course.at(exposed)
         (head_pan, _), (head_tilt, _) = self._head_controller.head.motion_at(exposed)
         scale = math.cos(tilt)
-        expected = ExpectedTarget(
-            np.array([(pan - head_pan) * scale, head_tilt - tilt]),
-            np.diag([pan_variance * scale**2, tilt_variance]),
-            np.array(course.sides) / 2,
-            SIZE_SIGMA,
+        seen = Appearance(  # in tangents: at a focal length of 1
+            offset_px=np.array([(pan - head_pan) * scale, head_tilt - tilt]),
+            covariance=np.diag([pan_variance * scale**2, tilt_variance]),
+            size_px=1.0,
+            size_sigma=SIZE_SIGMA,
+            focal_px=np.ones(2),
+            sides=course.sides,
         )
         now_px = self._zoom.at(rig.zoom.state().focal_px).focal_px[0]
         wanted_px = self._target.wanted_px / course.size
         if not course.whole:  # do not zoom in before the whole target was seen
             wanted_px = min(wanted_px, true_px)
-        focal_px, _ = self._policy.choose(expected, wanted_px, true_px, now, now_px)
+        focal_px, _ = self._policy.choose(seen, wanted_px, true_px, now, now_px)
         if abs(focal_px / true_px - 1) > NO_CHANGE:
             self._focal = rig.zoom.zoom(self._zoom.nominal_for(focal_px))
 

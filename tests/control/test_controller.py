@@ -101,12 +101,14 @@ class Known:
     def wanted_size(self):
         return WantedSize(BOOK.size, BOOK.wanted_px)
 
-    def appearance(self, pan, tilt, nominal_px):
+    def appearance(self, pan, tilt, nominal_px, shape=1.0):
         x, y, z = self.x_fixed
         focal = TRUE * nominal_px
         off = np.tan([math.atan2(x, z) - pan, math.atan2(y, math.hypot(x, z)) + tilt])
         covariance = np.eye(2) * (focal * self.sigma) ** 2
-        return Appearance(focal * off, covariance, focal * BOOK.size / z, 0.0, np.full(2, focal))
+        return Appearance(
+            focal * off, covariance, focal * BOOK.size / z, 0.0, np.full(2, focal), self.target.sides(shape)
+        )
 
 
 def moving(speed, **known):

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from cotarget.control.zoom import ExpectedTarget, ZoomController, ZoomSettings, chance_inside, expect, longest_focal
-from cotarget.estimation import TargetFilter
+from cotarget.control.zoom import ZoomController, ZoomSettings, chance_inside, longest_focal
+from cotarget.estimation import Appearance, TargetFilter
 from tests.support.moving_targets import APART, Flight, show
 
 SIZE = (640, 480)
@@ -18,7 +18,9 @@ EXACT = 1e-6  # relative error of a root that is found iteratively
 
 
 def expected(sigma, offset=(0.0, 0.0), half=(0.01, 0.015), size_sigma=0.0):
-    return ExpectedTarget(np.array(offset), np.eye(2) * sigma**2, np.array(half), size_sigma)
+    """A predicted target, in tangents: at a focal length of 1."""
+    sides = tuple(2 * np.array(half))
+    return Appearance(np.array(offset), np.eye(2) * sigma**2, 1.0, size_sigma, np.ones(2), sides)
 
 
 @pytest.mark.parametrize(("sigma", "offset"), [(0.002, (0.0, 0.0)), (0.01, (0.02, -0.01)), (0.03, (0.0, 0.03))])
@@ -109,18 +111,18 @@ def test_an_estimate_says_what_to_expect():
         show(estimator, flight.zoom(t + APART))
     t = flight.times[-1] + 0.2
     pan, tilt = flight.aimed(t)
-    seen = expect(estimator.estimate(t), pan, tilt, 1700.0, shape=0.26)
-    assert np.hypot(*seen.offset) < 4 * math.sqrt(np.trace(seen.covariance)) + 0.01
+    seen = estimator.estimate(t).appearance(pan, tilt, 1700.0, 0.26)
+    assert np.hypot(*seen.offset) < 4 * math.sqrt(seen.variance.sum()) + 0.01
     distance = np.linalg.norm(flight.path(t) - flight.truth.gamma.inv().translation)
     np.testing.assert_allclose(seen.half, np.array([0.26, 1.0]) * flight.size / 2 / distance, rtol=0.1)
     # Where the head is 2 degrees short of it in pan, it stands that much to the right.
-    short = expect(estimator.estimate(t), pan - math.radians(2), tilt, 1700.0)
+    short = estimator.estimate(t).appearance(pan - math.radians(2), tilt, 1700.0)
     assert short.offset[0] - seen.offset[0] == pytest.approx(math.tan(math.radians(2)), rel=0.05)
     # The farther ahead, the wider.
     focals = [
-        longest_focal(expect(estimator.estimate(t), *flight.aimed(t), 1700.0, shape=0.26), 0.95, SIZE, RANGE)
+        longest_focal(estimator.estimate(t).appearance(*flight.aimed(t), 1700.0, 0.26), 0.95, SIZE, RANGE)
         for t in flight.times[-1] + np.array([0.1, 0.5, 1.0])
         if flight.path.x[-1] > t
     ]
     assert (np.diff(focals) < 0).all()
-    assert expect(estimator.estimate(t), pan + math.pi, tilt, 1700.0) is None
+    assert estimator.estimate(t).appearance(pan + math.pi, tilt, 1700.0) is None
