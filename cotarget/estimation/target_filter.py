@@ -10,9 +10,7 @@ by itself is as good as the calibration. Gates and inflations: docs/design-notes
 
 import bisect
 import math
-import operator
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -91,48 +89,38 @@ def sound(node: Node, nearest: float) -> Node | None:
 
 # An iterated correction ends when the logarithm of the depth changes by less, or after so many iterations.
 CONVERGED, MOST_ITERATIONS = 1e-3, 4
-# Sort key of observations: time, and the fixed camera before the zoom camera.
-KEY = operator.attrgetter("t", "order")
 
 
 @dataclass(frozen=True)
-class SizeObservation:
-    """Observed size, as the depth at which a target of nominal size looks that large.
+class Observation:
+    """Centre of the target in one camera's image, and its apparent size in the fixed camera's.
 
     Attributes:
-        log_depth: logarithm of that depth.
-        sigma: standard deviation of that logarithm.
+        t: exposure time [s].
+        tangent: tangents of the centre in the camera's frame, (2,).
+        R: their covariance, (2, 2).
+        sight: sight line of the zoom camera; None for an observation in the fixed image.
+        log_depth: apparent size, as the logarithm of the depth at which a target of nominal size looks that large; None
+            where no size was observed.
+        log_depth_sigma: standard deviation of that logarithm.
         bound: whether it is an upper bound only: a clipped target is at least that large, so at most that far.
     """
 
-    log_depth: float
-    sigma: float
+    t: float
+    tangent: Array
+    R: Array
+    sight: SightLine | None = None
+    log_depth: float | None = None
+    log_depth_sigma: float = math.inf
     bound: bool = False
 
-
-@dataclass(frozen=True)
-class FixedObservation:
-    """Observation in the fixed image: tangents of the centre (2,), their covariance (2, 2), and the apparent size."""
-
-    t: float
-    tangent: Array
-    R: Array
-    size: SizeObservation | None
-    order: ClassVar[int] = 0
+    @property
+    def order(self) -> tuple[float, bool]:
+        """Sort key: the time, and the fixed camera before the zoom camera."""
+        return self.t, self.sight is not None
 
 
-@dataclass(frozen=True)
-class ZoomObservation:
-    """Observation in the zoom image: tangents of the centre (2,), their covariance (2, 2), and the sight line."""
-
-    t: float
-    tangent: Array
-    R: Array
-    sight: SightLine
-    order: ClassVar[int] = 1
-
-
-def begin(observed: FixedObservation, settings: FilterSettings) -> Node:
+def begin(observed: Observation, settings: FilterSettings) -> Node:
     """Initialise the state from the first measurement.
 
     `fixed_t` stays unset, so that the second measurement counts fully: an error that both share does not change the
@@ -142,8 +130,9 @@ def begin(observed: FixedObservation, settings: FilterSettings) -> Node:
     x = np.zeros(STATES)
     x[:2] = observed.tangent
     x[LOG_APPARENT] = motion.attitude_mean
-    size = observed.size
-    x[LOG_DEPTH] = math.log(USUAL_DEPTH) if size is None or size.bound else size.log_depth + x[LOG_APPARENT]
+    x[LOG_DEPTH] = math.log(USUAL_DEPTH)
+    if observed.log_depth is not None and not observed.bound:
+        x[LOG_DEPTH] = observed.log_depth + x[LOG_APPARENT]
     nearness = math.exp(-x[LOG_DEPTH])
     sigma = np.zeros(STATES)
     sigma[LOG_DEPTH] = settings.depth_sigma
@@ -152,12 +141,12 @@ def begin(observed: FixedObservation, settings: FilterSettings) -> Node:
     sigma[[PAN, TILT]] = motion.bias_sigma
     P = np.diag(sigma**2)
     P[:2, :2] = observed.R
-    return _correct_size(Node(observed.t, x, P), observed.size, settings)
+    return _correct_size(Node(observed.t, x, P), observed, settings)
 
 
-def correct_fixed(node: Node, observed: FixedObservation, settings: FilterSettings) -> Node:
+def correct_fixed(node: Node, observed: Observation, settings: FilterSettings) -> Node:
     """Correct a node with a centre and a size in the fixed image."""
-    if observed.size is None or observed.size.bound:
+    if observed.log_depth is None or observed.bound:
         node = _with_fading_velocity(node, settings)
     PHt = node.P[:, :2]
     innovation = observed.tangent - node.x[:2]
@@ -167,7 +156,7 @@ def correct_fixed(node: Node, observed: FixedObservation, settings: FilterSettin
     if nis > settings.jump_gate:
         if node.rejected_fixed + 1 < settings.misses:
             return replace(node, rejected_fixed=node.rejected_fixed + 1, rejected_zoom=0)
-        return _correct_size(_restarted(node, observed, settings), observed.size, settings)
+        return _correct_size(_restarted(node, observed, settings), observed, settings)
     if nis > CENTER_GATE:  # worse than its noise says: it counts as much as one at the gate
         S_inv = _inverse(PHt[:2] + R * (nis / CENTER_GATE))
         nis = float(innovation @ S_inv @ innovation)
@@ -180,16 +169,16 @@ def correct_fixed(node: Node, observed: FixedObservation, settings: FilterSettin
         rejected_fixed=0,
         fixed_t=node.t,
     )
-    return _correct_size(node, observed.size, settings)
+    return _correct_size(node, observed, settings)
 
 
-def correct_zoom(node: Node, observed: ZoomObservation, settings: FilterSettings) -> Node:
+def correct_zoom(node: Node, observed: Observation, sight: SightLine, settings: FilterSettings) -> Node:
     """Correct a node with a centre in the zoom image, iterated because the depth enters nonlinearly."""
     if node.rejected_zoom >= settings.zoom_misses:
         node = replace(node, P=inflated(node.P, settings), rejected_zoom=0)
     x, nis = node.x, 0.0
     for i in range(MOST_ITERATIONS):
-        tangent, J, d = observed.sight.project(x)
+        tangent, J, d = sight.project(x)
         innovation = observed.tangent - tangent + J @ (x - node.x)[SEEN]
         PHt = node.P[:, SEEN] @ J.T
         S_inv = _inverse(J @ PHt[SEEN] + observed.R)
@@ -206,17 +195,17 @@ def correct_zoom(node: Node, observed: ZoomObservation, settings: FilterSettings
     return replace(node, x=x, P=node.P - gain @ PHt.T, mean_nis=mean_nis, rejected_zoom=0)
 
 
-def _correct_size(node: Node, size: SizeObservation | None, settings: FilterSettings) -> Node:
+def _correct_size(node: Node, observed: Observation, settings: FilterSettings) -> Node:
     """Correct a node with an apparent size, see `OF_SIZE`."""
-    if size is None:
+    if observed.log_depth is None:
         return node
     P, h = node.P, OF_SIZE
     # Limbs and wings move the box's sides together for a while, so sizes in quick succession share their error.
-    variance = size.sigma**2 * _variance_factor(node.t - node.size_t, settings.size_s)
+    variance = observed.log_depth_sigma**2 * _variance_factor(node.t - node.size_t, settings.size_s)
     Ph = P @ h
     S = float(h @ Ph) + variance
-    innovation = size.log_depth - float(h @ node.x)
-    if size.bound and innovation >= 0:  # the state is nearer than the bound already
+    innovation = observed.log_depth - float(h @ node.x)
+    if observed.bound and innovation >= 0:  # the state is nearer than the bound already
         return node
     if innovation * innovation > GATE * S:
         if node.rejected_size + 1 < settings.misses:
@@ -228,7 +217,7 @@ def _correct_size(node: Node, size: SizeObservation | None, settings: FilterSett
         S = float(h @ Ph) + variance
     x = node.x + Ph * (innovation / S)
     P = P - np.outer(Ph, Ph / S)
-    return replace(node, x=x, P=P, rejected_size=0, size_t=node.size_t if size.bound else node.t)
+    return replace(node, x=x, P=P, rejected_size=0, size_t=node.size_t if observed.bound else node.t)
 
 
 def _with_fading_velocity(node: Node, settings: FilterSettings) -> Node:
@@ -252,7 +241,7 @@ def _mean_nis(node: Node, nis: float, settings: FilterSettings) -> float:
     return node.mean_nis + settings.nis_gain * (nis / 2 - node.mean_nis)
 
 
-def _restarted(node: Node, observed: FixedObservation, settings: FilterSettings) -> Node:
+def _restarted(node: Node, observed: Observation, settings: FilterSettings) -> Node:
     """Restart position and motion at the measured place after a jump; size and head bias stay."""
     motion = settings.motion
     x, P = node.x.copy(), node.P.copy()
@@ -315,7 +304,7 @@ class TargetFilter:
         self._settings = settings or filter_settings(target, calibration)
         self._sight_lines = SightLines(calibration)
         self._base: Node | None = None  # state before the first kept measurement
-        self._observed: list[FixedObservation | ZoomObservation] = []
+        self._observed: list[Observation] = []
         self._nodes: list[Node | None] = []  # state after each of them; None before the first in the fixed image
 
     def add_fixed(
@@ -349,8 +338,12 @@ class TargetFilter:
         side = height if vertical else width
         if size_px is not None and not detection.clipped:
             side = size_px
-        size = self._size(side, J[int(vertical), int(vertical)], bound=detection.clipped)
-        return self._insert(FixedObservation(t, z, (J * np.array([sigma_u**2, sigma_v**2])) @ J.T, size))
+        R = (J * np.array([sigma_u**2, sigma_v**2])) @ J.T
+        log_depth, sigma = None, math.inf
+        if side > 0:
+            log_depth = math.log(self._target.size / (side * abs(J[int(vertical), int(vertical)])))
+            sigma = math.hypot(settings.side_of_size, settings.side_px / side)
+        return self._insert(Observation(t, z, R, None, log_depth, sigma, detection.clipped))
 
     def add_zoom(
         self,
@@ -384,7 +377,7 @@ class TargetFilter:
             return False
         z, J = found
         R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * head_sigma**2
-        return self._insert(ZoomObservation(t, z, R, self._sight_lines.at(pan, tilt, nominal_px)))
+        return self._insert(Observation(t, z, R, self._sight_lines.at(pan, tilt, nominal_px)))
 
     def estimate(self, t: float) -> Estimate | None:
         """Estimate the target at a time [s], after the newest measurement or up to `history_s` before it.
@@ -423,19 +416,12 @@ class TargetFilter:
                 return node
         return None
 
-    def _size(self, size_px: float, tangent_per_px: float, *, bound: bool) -> SizeObservation | None:
-        """Convert a size in the image [px], or a lower bound of it, to a size measurement."""
-        if not size_px > 0:
-            return None
-        sigma = math.hypot(self._settings.side_of_size, self._settings.side_px / size_px)
-        return SizeObservation(math.log(self._target.size / (size_px * abs(tangent_per_px))), sigma, bound)
-
-    def _insert(self, observed: FixedObservation | ZoomObservation) -> bool:
+    def _insert(self, observed: Observation) -> bool:
         """Insert an observation at its time, repeat the later corrections, and drop what is older than the history."""
         if not math.isfinite(observed.t) or (self._base is not None and observed.t < self._base.t):
             return False
-        at = bisect.bisect_left(self._observed, KEY(observed), key=KEY)
-        if at < len(self._observed) and KEY(self._observed[at]) == KEY(observed):  # a repeated frame
+        at = bisect.bisect_left(self._observed, observed.order, key=lambda each: each.order)
+        if at < len(self._observed) and self._observed[at].order == observed.order:  # a repeated frame
             return False
         self._observed.insert(at, observed)
         del self._nodes[at:]
@@ -446,17 +432,17 @@ class TargetFilter:
             self._observed.pop(0)
         return True
 
-    def _step(self, node: Node | None, observed: FixedObservation | ZoomObservation) -> Node | None:
+    def _step(self, node: Node | None, observed: Observation) -> Node | None:
         """Propagate a node to a measurement's time and correct it."""
         settings = self._settings
         nearest = settings.motion.nearest
         if node is None:
-            return sound(begin(observed, settings), nearest) if isinstance(observed, FixedObservation) else None
+            return sound(begin(observed, settings), nearest) if observed.sight is None else None
         x, P = self._propagate(node, observed.t)
         node = replace(node, t=observed.t, x=x, P=P)
-        if isinstance(observed, FixedObservation):
+        if observed.sight is None:
             corrected = correct_fixed(node, observed, settings)
         else:
-            corrected = correct_zoom(node, observed, settings)
+            corrected = correct_zoom(node, observed, observed.sight, settings)
         # A correction that is not finite is left out.
         return sound(corrected, nearest) or sound(node, nearest)
