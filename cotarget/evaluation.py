@@ -168,7 +168,7 @@ class TruthFinder:
         missed: Callable[[float], bool] = lambda t: False,
     ) -> None:
         """Create a finder of the target ``name``, which fails in frames whose exposure times [s] are ``missed``."""
-        self._view = CloseupFinder(calibration, target).view
+        self._map = CloseupFinder(calibration, target).affine_map
         self._truth, self._name, self._missed = truth, name, missed
         self._numbers_at = counted(seed + FINDER_SEED)
 
@@ -181,14 +181,14 @@ class TruthFinder:
 
     def find(self, frame: Frame, x_fixed: Array, covariance: Array, pose: Pose) -> ZoomMeasurement | None:
         """Find the target; None if its centre is outside the frame or outside the gate."""
-        view, box = self._view(x_fixed, covariance, pose), self._truth.box(self._name, "zoom", frame.t)
-        if view is None or box is None or self._missed(frame.t):
+        A, box = self._map(x_fixed, pose), self._truth.box(self._name, "zoom", frame.t)
+        if A is None or box is None or self._missed(frame.t):
             return None
         noise = self.SIGMA_PX * self._numbers_at(frame.t).normal(size=2)
         at = self._truth.center_px(self._name, "zoom", frame.t) + noise
-        off = at - view.center_px
+        off = at - A[:, 2]
         inside = (at >= 0).all() and (at <= np.array(frame.image.shape[1::-1]) - 1).all()
-        if not inside or off @ np.linalg.solve(view.covariance, off) > GATE:
+        if not inside or off @ np.linalg.solve(covariance, off) > GATE:
             return None
         return ZoomMeasurement(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), frame.t)
 

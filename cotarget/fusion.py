@@ -140,6 +140,7 @@ class ZoomSearch:
         self._make_finder = partial(finder or partial(CloseupFinder, settings=matching), calibration, profile)
         self._filter = filter or filter_settings(profile, calibration)
         self._settings, self._latest_s, self._closed_loop = settings, matching.latest_s, closed_loop
+        self._least_variance_px = matching.least_sigma_px**2
         self.states = StateHistory()
         self.waiting: deque[Frame] = deque()
         self._zoom_t = math.inf
@@ -154,7 +155,7 @@ class ZoomSearch:
             self.finder, self.unfound_s = self._make_finder(), 0.0
 
     def add_frame(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
-        """Register the followed target in the zoom image and update its filter.
+        """Find the followed target in the zoom image, and correct its 3D state by the offset found there.
 
         A zoom frame newer than the fixed camera's waits until the fixed camera has shown the target at about its time.
 
@@ -254,7 +255,8 @@ class ZoomSearch:
             wider = replace(estimate, state_covariance=inflated(estimate.state_covariance, self._filter))
             searched = wider.appearance(pose.pan, pose.tilt, pose.nominal_px) or seen
         true = replace(pose, pan=pose.pan + estimate.bias[0], tilt=pose.tilt + estimate.bias[1])
-        found = self.finder.find(frame, estimate.x_fixed, searched.covariance, true)
+        covariance = searched.covariance + self._least_variance_px * np.eye(2)
+        found = self.finder.find(frame, estimate.x_fixed, covariance, true)
         self._count_unfound(frame, found, seen, estimate)
         return found
 

@@ -7,7 +7,7 @@ place counts only if it leads the next best one. The source of the numbers: docs
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import cv2
@@ -207,26 +207,6 @@ def _whitening(background: Image, settings: MatchingSettings) -> Array:
 
 
 @dataclass(frozen=True)
-class ZoomView:
-    """Local mapping from the fixed image around the target to a zoom image.
-
-    Attributes:
-        center_px: expected centre of the target in the zoom image (u, v), (2,).
-        covariance: covariance of that centre [px^2], (2, 2).
-        J: Jacobian at the target's depth, zoom pixels per fixed pixel, (2, 2).
-    """
-
-    center_px: Array
-    covariance: Array
-    J: Array
-
-    @property
-    def scale(self) -> float:
-        """Zoom pixels per pixel of the fixed image."""
-        return math.sqrt(abs(float(np.linalg.det(self.J))))
-
-
-@dataclass(frozen=True)
 class ZoomMeasurement:
     """Measurement of the body's centre in a zoom image, by registration.
 
@@ -243,54 +223,67 @@ class ZoomMeasurement:
     t: float
 
 
-def register(frame: Frame, fixed_view: FixedView, view: ZoomView, settings: MatchingSettings) -> ZoomMeasurement | None:
+def register(
+    frame: Frame, fixed_view: FixedView, A: Array, covariance: Array, settings: MatchingSettings
+) -> ZoomMeasurement | None:
     """Find a target's cut-out in a zoom frame, first coarsely, then finely.
 
     Args:
         frame: frame of the zoom camera.
         fixed_view: the target in the fixed image.
-        view: mapping from the fixed to the zoom image.
+        A: affine map from the fixed image around the target's centre to the zoom image, (2, 3); see
+            `CloseupFinder.affine_map`.
+        covariance: covariance of the target's expected centre in the zoom image [px^2], (2, 2).
         settings: settings of the registration.
 
     Returns:
         The measurement; None if nothing correlates, if two places do, or if the maximum lies beyond the gate.
     """
+    J = A[:, :2]
+    scale = math.sqrt(abs(float(np.linalg.det(J))))  # zoom pixels per pixel of the fixed image
     coarse, fine = (
-        max(fixed_view.side_px / samples, 1 / view.scale)
-        for samples in (settings.coarse_samples, settings.fine_samples)
+        max(fixed_view.side_px / samples, 1 / scale) for samples in (settings.coarse_samples, settings.fine_samples)
     )
-    center_px = _search(frame.image, fixed_view, view, coarse, None, settings)
+    center_px = _search(frame.image, fixed_view, A, coarse, covariance, settings)
     if center_px is None:
         return None
-    near, reach = replace(view, center_px=center_px), math.ceil(coarse / fine / 2)
-    center_px = _search(frame.image, fixed_view, near, fine, reach, settings)
+    A = np.column_stack([J, center_px])
+    center_px = _search(frame.image, fixed_view, A, fine, math.ceil(coarse / fine / 2), settings)
     if center_px is None:
         return None
     return ZoomMeasurement(
         center_px=center_px,
-        sigma_px=settings.sigma_px * (1 + fine) * view.scale,
-        body_sigma_px=np.abs(view.J) @ fixed_view.body_sigma_px,
+        sigma_px=settings.sigma_px * (1 + fine) * scale,
+        body_sigma_px=np.abs(J) @ fixed_view.body_sigma_px,
         t=frame.t,
     )
 
 
 def _search(
-    image: Image, fixed_view: FixedView, view: ZoomView, pitch: float, reach: int | None, settings: MatchingSettings
+    image: Image, fixed_view: FixedView, A: Array, pitch: float, within: Array | int, settings: MatchingSettings
 ) -> Array | None:
     """Find the place of highest correlation with a cut-out sampled every ``pitch`` fixed pixels, (2,) [px].
 
-    The search covers ``reach`` samples to each side of the view's centre, and the place must correlate well. If it is
-    None, the search covers all samples inside the gate, and the place must lead the next best one.
+    Args:
+        image: zoom image, (H, W, 3) BGR.
+        fixed_view: the target in the fixed image.
+        A: affine map from the fixed image around the target's centre to the zoom image, (2, 3).
+        pitch: distance of the samples [px of the fixed image].
+        within: number of samples searched to each side of the expected centre; the place must correlate well. Or
+            covariance of that centre [px^2], (2, 2), for all samples inside the gate; the place must lead the next best
+            one.
+        settings: settings of the registration.
     """
     template, weight, middle = fixed_view.at_pitch(pitch)
-    step = view.J * pitch  # zoom pixels per sample
-    back = np.linalg.inv(step)
-    spread = back @ view.covariance @ back.T + np.diag((fixed_view.body_sigma_px / pitch) ** 2)
-    if reach is None:
-        sides = np.minimum(np.ceil(np.sqrt(GATE * np.diag(spread))).astype(int), settings.widest_search) + 1
+    step = A[:, :2] * pitch  # zoom pixels per sample
+    spread = None
+    if isinstance(within, int):
+        sides = np.full(2, within + 1)  # and the neighbours of a maximum
     else:
-        sides = np.full(2, reach + 1)  # and the neighbours of a maximum
-    first_px = view.center_px - step @ (middle + sides)
+        back = np.linalg.inv(step)
+        spread = back @ within @ back.T + np.diag((fixed_view.body_sigma_px / pitch) ** 2)
+        sides = np.minimum(np.ceil(np.sqrt(GATE * np.diag(spread))).astype(int), settings.widest_search) + 1
+    first_px = A[:, 2] - step @ (middle + sides)
     width, height = (np.array(weight.shape[::-1]) + 2 * sides).tolist()
     samples, inside = resample(image, np.column_stack([step, first_px]), (width, height))
     if pitch < 1:  # blur the zoom samples as the fixed camera does, where the sampling resolves it
@@ -298,7 +291,7 @@ def _search(
     mix = fixed_view.whitening
     likeness, seen = correlate(cv2.transform(samples, mix), inside, cv2.transform(template, mix), weight)
     allowed = seen >= settings.least_seen
-    if reach is None:
+    if spread is not None:
         v, u = np.mgrid[-sides[1] : sides[1] + 1, -sides[0] : sides[0] + 1]
         off = np.stack([u, v], axis=-1)
         allowed &= np.einsum("ijk,kl,ijl->ij", off, np.linalg.inv(spread), off) <= GATE
@@ -309,7 +302,7 @@ def _search(
     if not allowed[row, column] or top is None:
         return None
     best = float(likeness[row, column])
-    if reach is None:
+    if spread is not None:
         # Places whose boxes overlap are one place.
         apart = fixed_view.size_px / pitch
         low = np.maximum(np.ceil([column - apart[0], row - apart[1]]), 0).astype(int)
@@ -395,13 +388,24 @@ class CloseupFinder:
         Returns:
             The measurement; None if the target is not found, or not with certainty.
         """
-        fixed_view, view = self.fixed_view_at(frame.t), self.view(x_fixed, covariance, pose)
-        return None if fixed_view is None or view is None else register(frame, fixed_view, view, self._settings)
+        fixed_view, A = self.fixed_view_at(frame.t), self.affine_map(x_fixed, pose)
+        if fixed_view is None or A is None or not np.isfinite(covariance).all():
+            return None
+        return register(frame, fixed_view, A, covariance, self._settings)
 
-    def view(self, x_fixed: Array, covariance: Array, pose: Pose) -> ZoomView | None:
-        """Map the surroundings of the target to the zoom image; None behind a camera or outside its lens model."""
-        x, covariance = np.asarray(x_fixed, dtype=float), np.asarray(covariance, dtype=float)
-        if not (np.isfinite(x).all() and np.isfinite(covariance).all() and x[2] > 0):
+    def affine_map(self, x_fixed: Array, pose: Pose) -> Array | None:
+        """Map the fixed image around a target to the zoom image.
+
+        Args:
+            x_fixed: position of the target [m], (3,).
+            pose: head and lens; the true angles, as far as they are known.
+
+        Returns:
+            Jacobian at the target's depth, zoom pixels per fixed pixel, and place of the target in the zoom image [px],
+            (2, 3); None behind a camera or outside its lens model.
+        """
+        x = np.asarray(x_fixed, dtype=float)
+        if not (np.isfinite(x).all() and x[2] > 0):
             return None
         # A small cross at the target, parallel to the fixed image plane, for numerical derivatives.
         cross = x + STEP * x[2] * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
@@ -410,4 +414,4 @@ class CloseupFinder:
         if not (np.isfinite(zoom).all() and np.isfinite(fixed).all()):
             return None
         J = (zoom[1:3] - zoom[3:5]).T @ np.linalg.inv((fixed[1:3] - fixed[3:5]).T)
-        return ZoomView(zoom[0], covariance + self._settings.least_sigma_px**2 * np.eye(2), J)
+        return np.column_stack([J, zoom[0]])
