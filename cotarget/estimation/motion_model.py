@@ -170,26 +170,14 @@ MOST_UNCERTAINTY = 0.5
 MOST_DEPTH_VARIANCE = 1.5**2
 
 
-@dataclass(frozen=True)
-class Span:
-    """Parts of a prediction that depend only on the time step.
-
-    Attributes:
-        linear: linear motion before the division by the new depth, (13, 13).
-        noise: covariance of position, velocity and acceleration for unit variance of the acceleration, (9, 9).
-        drift: variances that attitude and bias gain, (13, 13).
-        reach: position gained per unit of acceleration [s^2].
-    """
-
-    linear: Array
-    noise: Array
-    drift: Array
-    reach: float
-
-
 @functools.lru_cache(maxsize=1024)  # frames come at regular intervals
-def span_of(dt: float, motion: MotionSettings) -> Span:
-    """Compute the parts of a prediction over a time step ``dt`` > 0 [s]; cached."""
+def transition(dt: float, motion: MotionSettings) -> tuple[Array, Array, Array]:
+    """Compute the parts of a prediction that depend only on the time step ``dt`` > 0 [s]; cached.
+
+    Returns:
+        Linear motion before the division by the new depth, (13, 13); covariance of position, velocity and acceleration
+        for unit variance of the acceleration, (9, 9); variances that attitude and bias gain, (13, 13).
+    """
     tau = motion.manoeuvre_s
     rho = math.exp(-dt / tau)
     gain = -tau * math.expm1(-dt / tau)
@@ -203,7 +191,7 @@ def span_of(dt: float, motion: MotionSettings) -> Span:
     sigmas = np.zeros(STATES)
     sigmas[LOG_APPARENT:] = motion.attitude_sigma, motion.bias_sigma, motion.bias_sigma
     drift = np.diag(sigmas**2 * (1 - linear.diagonal() ** 2))
-    return Span(linear, np.kron(_singer(dt, tau), np.eye(3)).astype(float), drift, reach)
+    return linear, np.kron(_singer(dt, tau), np.eye(3)).astype(float), drift
 
 
 def _singer(dt: float, tau: float) -> Array:
@@ -239,15 +227,16 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale
     """
     if dt <= 0:
         return x, P
-    span = span_of(dt, motion)
-    closer = 1 + float(x[VEL_Z]) * dt + float(x[ACC_Z]) * span.reach  # new depth over old depth
+    linear, noise, drift = transition(dt, motion)
+    reach = float(linear[TAN_X, ACC_X])  # position gained per unit of acceleration [s^2]
+    closer = 1 + float(x[VEL_Z]) * dt + float(x[ACC_Z]) * reach  # new depth over old depth
     ratio = max(closer, min(motion.nearest * math.exp(-x[LOG_DEPTH]), 1.0))
-    y = span.linear @ x
+    y = linear @ x
     log_depth = float(x[LOG_DEPTH]) + math.log(ratio)
     y[MOVING] /= ratio
     y[LOG_DEPTH] = log_depth
-    y[LOG_APPARENT] += motion.attitude_mean * (1 - span.linear[LOG_APPARENT, LOG_APPARENT])
-    F = span.linear.copy()
+    y[LOG_APPARENT] += motion.attitude_mean * (1 - linear[LOG_APPARENT, LOG_APPARENT])
+    F = linear.copy()
     F[MOVING] /= ratio
     F[LOG_DEPTH] = 0.0
     F[LOG_DEPTH, LOG_DEPTH] = 1.0
@@ -257,15 +246,15 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale
         shrink = y[MOVING] / ratio
         shrink[LOG_DEPTH] = -1 / ratio
         F[MOVING, VEL_Z] -= shrink * dt
-        F[MOVING, ACC_Z] -= shrink * span.reach
-    P = F @ P @ F.T + span.drift
+        F[MOVING, ACC_Z] -= shrink * reach
+    P = F @ P @ F.T + drift
     # Position noise along the axis scales everything that is divided by the depth.
     N = np.eye(LOG_SIZE)
     N[:, LOG_DEPTH] -= y[MOVING]
     N[LOG_DEPTH, LOG_DEPTH] = 1.0
     # The mean of 1 / depth^2 over the depth's distribution: an uncertain depth makes the noise larger.
     sigma = motion.acceleration * math.exp(min(P[LOG_DEPTH, LOG_DEPTH], MOST_UNCERTAINTY) - log_depth)
-    P[MOVING, MOVING] += N @ span.noise @ N.T * (noise_scale * sigma * sigma)
+    P[MOVING, MOVING] += N @ noise @ N.T * (noise_scale * sigma * sigma)
     if P[LOG_DEPTH, LOG_DEPTH] > MOST_DEPTH_VARIANCE:  # correlations stay, so the result is still a covariance
         scale = math.sqrt(MOST_DEPTH_VARIANCE / P[LOG_DEPTH, LOG_DEPTH])
         P[LOG_DEPTH] *= scale
