@@ -281,7 +281,7 @@ def _solve_one(target: Triple, d: Triple, t: Triple, head: HeadGeometry) -> list
 
 
 def _closed_form(target: Triple, d: Triple, t: Triple, sign: float, head: HeadGeometry) -> Triple:
-    """Compute true pan, true tilt and range in closed form: (13) and (16) with atan2.
+    """Compute true pan, true tilt and range in closed form: Eq. 13 and Eq. 16, with atan2.
 
     The ray d has length 1, and t is the zoom camera's position from the tilt axis, both in the head's frame. The sign
     is 1 for the branch that faces forward, -1 for the other. The result is exact for dz = 0. For dz != 0 the range
@@ -299,10 +299,10 @@ def _closed_form(target: Triple, d: Triple, t: Triple, sign: float, head: HeadGe
         on_axis = cos_eps * qx + sin_eps * qy
         y, z, height = qy - on_axis * sin_eps, cos_eps * qz, b - on_axis * sin_eps
         left = y * y + z * z - height * height
-        tilt = math.atan2(y, z) - math.atan2(height, sign * math.sqrt((left + abs(left)) / 2))  # (13)
-        x, _, ahead = _tilt((qx, qy, qz), math.cos(tilt), math.sin(tilt), head)  # (14)
+        tilt = math.atan2(y, z) - math.atan2(height, sign * math.sqrt((left + abs(left)) / 2))  # Eq. 13
+        x, _, ahead = _tilt((qx, qy, qz), math.cos(tilt), math.sin(tilt), head)  # Eq. 14
     z2 = ahead + dz
-    return math.atan2(a * z2 - c * x, a * x + c * z2), tilt, reach  # (16)
+    return math.atan2(a * z2 - c * x, a * x + c * z2), tilt, reach  # Eq. 16
 
 
 def _newton_step(
@@ -371,13 +371,13 @@ def shortcut(
     x_zoom0 = T_zoom0_fixed.apply(x_fixed.reshape(-1, 3)).reshape(x_fixed.shape)
     x_base = T_head_zoom.apply(x_zoom0.reshape(-1, 3)).reshape(x_fixed.shape)
     z = (x_fixed if reading == "table" else x_zoom0)[..., 2]
-    x_head = z[..., None] * T_head_zoom.rotation.as_matrix()[:, 2] + np.asarray(T_head_zoom.translation)  # (6)
+    x_head = z[..., None] * T_head_zoom.rotation.as_matrix()[:, 2] + np.asarray(T_head_zoom.translation)  # Eq. 6
     (x, y, z1), (a, b, c) = np.moveaxis(x_head, -1, 0), np.moveaxis(x_base, -1, 0)
     with np.errstate(invalid="ignore"):
-        tilt = np.arctan2(y, z1) - np.arcsin(b / np.hypot(y, z1))  # (13)
-        z2 = np.sin(tilt) * y + np.cos(tilt) * z1  # (14)
+        tilt = np.arctan2(y, z1) - np.arcsin(b / np.hypot(y, z1))  # Eq. 13 as printed
+        z2 = np.sin(tilt) * y + np.cos(tilt) * z1  # Eq. 14
         swing = np.arccos(a / np.hypot(x, z2))
-        pans = np.stack([np.arctan2(z2, x) + swing, np.arctan2(z2, x) - swing], axis=-1)  # (16)
+        pans = np.stack([np.arctan2(z2, x) + swing, np.arctan2(z2, x) - swing], axis=-1)  # Eq. 16
         off = np.abs(-np.sin(pans) * x[..., None] + np.cos(pans) * z2[..., None] - c[..., None])
         pan = np.where(off[..., 0] <= off[..., 1], pans[..., 0], pans[..., 1])
     return Pointing((pan + np.pi) % TURN - np.pi, tilt, np.where(np.isfinite(pan), z, np.nan))

@@ -212,7 +212,8 @@ def aim(
 ) -> Aim:
     """Solve pan, tilt and focal length for a target (Eqs. 6, 13, 16 and 17, with the exact range).
 
-    The target is either a point, or a pixel of the fixed camera with its depth.
+    The target is either a point, or a pixel of the fixed camera with its depth. The focal length shows the target at
+    the wanted size; while it is followed, `cotarget.control.zoom.ZoomController` decides how much of that is safe.
 
     Args:
         calibration: calibration of the rig.
@@ -247,7 +248,7 @@ def aim(
     if reach is None:
         focal_px = zoom.nominal_px
         reach = Reach((-math.pi, math.pi), (-math.pi, math.pi), (focal_px[0], focal_px[-1]))
-    x_base = head.in_base(x_fixed)  # (6)
+    x_base = head.in_base(x_fixed)  # Eq. 6
     wanted = zoom.stops[0].image_center_px if zoom_pixel is None else np.asarray(zoom_pixel, dtype=float)
     if wanted_size:  # start with the distance from the base for the range
         nominal_px = zoom.nominal_for(focal_for_size(wanted_size.size, wanted_size.wanted_px, math.hypot(*x_base)))
@@ -263,7 +264,7 @@ def aim(
             pointing = _paper(calibration, x_fixed, method, reach)
         if wanted_size:
             z = float(pointing.range * ray[2]) / math.hypot(*ray)
-            focal = focal_for_size(wanted_size.size, wanted_size.wanted_px, z)  # (17)
+            focal = focal_for_size(wanted_size.size, wanted_size.wanted_px, z)  # Eq. 17
             if wanted_size.vertical:  # this focal length is fy, and the lens is commanded by fx
                 fx, fy = lens.focal_px
                 focal *= fx / fy

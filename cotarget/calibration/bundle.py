@@ -1,6 +1,7 @@
 """Bundle adjustment: fit a rig's parameters and the boards' poses to the corners of all views.
 
-Every step of a calibration is one `fit`; the steps differ in which parameter blocks are free. With X a corner in the
+Every step of a calibration is one `fit`; the steps differ in which parameter blocks are free. The last one solves what
+is saved: T (T_head_zoom), Gamma (T_zoom0_fixed), the lenses and the head's axes. With X a corner in the
 board's frame, it is seen
 
     by the fixed camera at      x_fixed = T_fixed_board X

@@ -2,7 +2,8 @@
 
 `park_martin` solves X in closed form. `solve_hand_eye_from_motions` and `solve_hand_eye` start there and find the
 maximum-likelihood X, with its covariance and a verdict on what the motions determine. They serve a robot arm as well as
-a pan-tilt head, whose hand turns without shifting and whose X is the paper's T.
+a pan-tilt head, whose hand turns without shifting and whose X is the paper's T. A rig's calibration only starts here:
+the T that it saves is solved by `cotarget.calibration.bundle.fit`, from all corners at once.
 
 These two are weighted least squares on SE(3) with estimated weights. The six residuals of a motion or pose fall into
 groups (rotation and translation, or finer), each with its own standard deviation. It is estimated from the group's

@@ -173,7 +173,7 @@ def correct_fixed(node: Node, observed: Observation, settings: FilterSettings) -
 
 
 def correct_zoom(node: Node, observed: Observation, sight: SightLine, settings: FilterSettings) -> Node:
-    """Correct a node with a centre in the zoom image, iterated because the depth enters nonlinearly."""
+    """Correct the 3D state by the target's offset in the zoom image, iterated because the depth enters nonlinearly."""
     if node.rejected_zoom >= settings.zoom_misses:
         node = replace(node, P=inflated(node.P, settings), rejected_zoom=0)
     x, nis = node.x, 0.0
@@ -356,7 +356,7 @@ class TargetFilter:
         *,
         head_sigma: float = HEAD_SIGMA,
     ) -> bool:
-        """Add a centre of the target in the zoom image.
+        """Add a centre of the target in the zoom image, which corrects the 3D state, see `correct_zoom`.
 
         Args:
             pixel: centre of the target in the zoom image, (2,) [px].

@@ -481,7 +481,7 @@ class LiveTrack:
         return min(longest, self.seen - self.born)
 
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
-        """Whether the track ends: no detection for too long, or outside the image."""
+        """Whether the track is dropped: no detection for too long, or outside the image."""
         if self.missed and image_size is not None:
             (u, v), (width, height) = self.center, image_size
             if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
