@@ -19,7 +19,7 @@ from cotarget.config import TargetProfile
 from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome, TargetSelector, candidates_of
-from cotarget.control.zoom import ZoomSettings, is_seen_well, shape_of
+from cotarget.control.zoom import ZoomSettings, is_seen_well
 from cotarget.detection import Detections, Detector, make_detector
 from cotarget.detection.base import flood
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices, naming
@@ -482,7 +482,7 @@ class HeadRun:
             reason, aim = self._follow_unseen(target.estimate, track.seen_t, interval)
             return State.LOST, (f"out of sight for {t - track.seen_t:.1f} s", reason), aim
         try:
-            aim, zoom_reason = self.controller.drive(target.estimate, track.seen_t, interval, shape=shape_of(track))
+            aim, zoom_reason = self.controller.drive(target.estimate, track.seen_t, interval, shape=track.shape)
         except UnreachableError as error:
             target.unreachable = True
             return State.UNREACHABLE, (str(error),), None
@@ -499,7 +499,7 @@ class HeadRun:
         if pose is None or estimate is None or track.t - estimate.measured_t > self._settings.fusion.just_seen_s:
             return
         longest_px = self._rig.zoom.focal_range[1]
-        if is_seen_well(estimate, pose.pan, pose.tilt, pose.nominal_px, longest_px, shape=shape_of(track)):
+        if is_seen_well(estimate, pose.pan, pose.tilt, pose.nominal_px, longest_px, shape=track.shape):
             target.seen_well_s += seconds
 
     def _follow_unseen(self, predict: Predict, seen_t: float, interval: float) -> tuple[str, Aim | None]:

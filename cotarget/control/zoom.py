@@ -15,7 +15,6 @@ from scipy.optimize import brentq
 
 from cotarget.config import GOOD_SIZE
 from cotarget.estimation.measurement_model import Appearance, Estimate
-from cotarget.tracking.track import Track
 
 # Probability that the whole target is in the image: below it the lens zooms out, from it on the target is seen well.
 LIKELY = 0.8
@@ -37,12 +36,6 @@ class ZoomSettings:
     rim_px: float = 4.0
     deadband: float = 0.06
     settle_s: float = 0.3
-
-
-def shape_of(track: Track) -> float:
-    """Width over height of a track's usual box."""
-    width, height = track.size_px.tolist()
-    return float(width / height)
 
 
 def is_seen_well(

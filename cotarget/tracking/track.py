@@ -381,6 +381,12 @@ class Track:
     shared: bool = False
     seen_t: float = -math.inf
 
+    @property
+    def shape(self) -> float:
+        """Width over height of its usual box."""
+        width, height = self.size_px.tolist()
+        return float(width / height)
+
 
 class LiveTrack:
     """One track while it lives: image filter, histories and life cycle."""
