@@ -10,7 +10,7 @@ from cotarget.config import RigConfig
 from cotarget.control.selection import FirstCome
 from cotarget.control.zoom import ZoomSettings
 from cotarget.errors import ConfigError
-from cotarget.pipeline import State, follow
+from cotarget.pipeline import Run, State, follow
 from tests.support.formula_rig import (
     BOOK,
     CALIBRATION,
@@ -44,6 +44,15 @@ def beside(t):
 def frames_until(seconds):
     """First time of a frame at or after some seconds [s]."""
     return math.ceil(seconds / FRAME_S) * FRAME_S
+
+
+def test_a_run_goes_on_where_it_paused():
+    rig = FormulaRig()
+    paused = Run(rig_of(rig), CALIBRATION, BOOK, Seer(still))
+    first, later = list(paused.follow(1.0)), list(paused.follow(1.0))
+    assert [step.index for step in first + later] == list(range(len(first) + len(later)))
+    assert first[-1].state is State.FOLLOWING
+    assert all(step.target.id == first[-1].target.id for step in later)
 
 
 def test_states_from_searching_to_lost_and_back():
