@@ -302,17 +302,21 @@ def _search(
     if not allowed[row, column] or top is None:
         return None
     best = float(likeness[row, column])
-    if spread is not None:
-        # Places whose boxes overlap are one place.
-        apart = fixed_view.size_px / pitch
-        low = np.maximum(np.ceil([column - apart[0], row - apart[1]]), 0).astype(int)
-        high = np.floor([column + apart[0], row + apart[1]]).astype(int) + 1
-        score[low[1] : high[1], low[0] : high[0]] = -1.0
-        if best - max(float(score.max()), 0.0) < settings.least_lead:
-            return None
-    elif best < settings.least_score:
-        return None
-    return np.asarray(first_px + step @ (middle + top))
+    if spread is None:
+        is_sure = best >= settings.least_score
+    else:
+        is_sure = best - _next_best(score, (row, column), fixed_view.size_px / pitch) >= settings.least_lead
+    return np.asarray(first_px + step @ (middle + top)) if is_sure else None
+
+
+def _next_best(score: np.ndarray, place: tuple[int, int], size: Array) -> float:
+    """Return the highest score, at least 0, where a box of a size (u, v), (2,), does not overlap that at a place."""
+    row, column = place
+    low = np.maximum(np.ceil([column - size[0], row - size[1]]), 0).astype(int)
+    high = np.floor([column + size[0], row + size[1]]).astype(int) + 1
+    others = score.copy()
+    others[low[1] : high[1], low[0] : high[0]] = -1.0
+    return max(float(others.max()), 0.0)
 
 
 class Finder(Protocol):
