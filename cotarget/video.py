@@ -3,8 +3,6 @@
 import contextlib
 import logging
 import math
-import os
-from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -17,101 +15,10 @@ import cv2
 import numpy as np
 
 from cotarget.errors import CotargetError
-from cotarget.files import PartFile, write_all
+from cotarget.files import PartFile
 from cotarget.rig import Frame, Image
-from cotarget.safety.signals import deferred_signals
 
 log = logging.getLogger(__name__)
-
-# Codecs in which a packet without a frame is normal, and those in which one smaller than FFmpeg's MAX_NVOP_SIZE [bytes]
-# repeats the frame before it.
-HIDES_FRAMES, REPEATS, SMALLEST = ("vp8",), ("mpeg4",), 20
-
-
-class Places:
-    """Number the frames of a film as they are decoded, so that lost frames do not shift those after them.
-
-    Until the decoder refuses a packet, frames are counted. After that, packets due before a decoded frame that did not
-    become frames were lost and keep their numbers, as do those after the last frame. Where packets have no presentation
-    time, or a frame may have two packets, frames are only counted.
-
-    Attributes:
-        number: number of the newest frame, from 0.
-        reason: reason why the first packet was refused, in brackets; empty if none was.
-    """
-
-    def __init__(self, stream: av.VideoStream) -> None:
-        stream.codec_context.copy_opaque = True  # so that a frame carries its packet's number
-        codec = stream.codec_context.name
-        self.number, self.reason = -1, ""
-        self._known, self._smallest = codec not in HIDES_FRAMES, SMALLEST if codec in REPEATS else 0
-        # For each packet: its part of the film, its time in that part, and whether it must become a frame.
-        self._waiting: dict[int, tuple[int, int, bool]] = {}
-        self._packets = self._part = self._time = 0
-        self._refused = self._refused_inside = self._lost = 0
-        # Number of the first lost frame, and of the first frame after a refusal.
-        self._first: int | None = None
-        self._first_refused: int | None = None
-
-    def expect(self, packet: av.Packet) -> None:
-        """Register a packet before it is decoded."""
-        if not packet.size or not self._known:
-            return
-        if packet.pts is None:
-            self._forget()
-            return
-        if packet.dts is not None:
-            self._part += packet.dts < self._time  # time restarts where films were joined
-            self._time = packet.dts
-        packet.opaque = self._packets
-        self._waiting[self._packets] = self._part, packet.pts, packet.size >= self._smallest
-        self._packets += 1
-
-    def refuse(self, error: av.error.FFmpegError) -> None:
-        """Count a packet that the decoder refused."""
-        self._refused += 1
-        self.reason = self.reason or f" ({reason_of(error)})"
-
-    def take(self, picture: av.VideoFrame) -> None:
-        """Assign a number to a decoded frame."""
-        place = self._waiting.pop(picture.opaque, None) if isinstance(picture.opaque, int) else None
-        if place is None or picture.interlaced_frame:  # an interlaced frame may have a packet for each field
-            self._forget()
-        else:
-            self._lose([packet for packet, at in self._waiting.items() if at[:2] < place[:2]])
-        self.number += 1
-        if self._refused and self._first_refused is None:
-            self._first_refused = self.number
-        self._refused_inside = self._refused
-
-    def _forget(self) -> None:
-        """Stop tracking packets; from now on frames are only counted."""
-        self._known = False
-        self._waiting.clear()
-
-    def _lose(self, packets: list[int]) -> None:
-        """Skip the numbers of packets that did not become frames, if any packet was refused."""
-        count = sum(self._waiting.pop(packet)[2] for packet in packets)
-        if not (self._refused and count):
-            return
-        self._first = self.number + 1 if self._first is None else self._first
-        self._lost += count
-        self.number += count
-
-    def describe(self, *, ended: bool) -> str:
-        """Describe what was lost, after the last frame; empty if nothing was.
-
-        Args:
-            ended: whether the message already says that the film ends early, so that packets after it do not count.
-        """
-        lost, refused = self._lost, self._refused_inside
-        if not ended:  # PyAV reports no refusal once the decoder has returned a frame of the last packets
-            lost, refused = lost + sum(needed for _, _, needed in self._waiting.values()), self._refused
-        if not (count := max(lost, refused)):
-            return ""
-        packets = "1 packet" if count == 1 else f"{count} packets"
-        starts = (first for first in (self._first, self._first_refused, self.number + 1) if first is not None)
-        return f"{packets} from frame {next(starts)} on could not be decoded{self.reason}"
 
 
 def reason_of(error: Exception) -> str:
@@ -126,7 +33,6 @@ FROM_ZERO = "matroska,webm"  # its duration counts from time 0, and not from the
 MICROSECONDS = 1e6  # FFmpeg's units of duration per second
 # Least shortfall of a film, the longer of the two: the last frame's length and edits at the end are stated roughly.
 SHORT_S, SHORT_FRAMES = 0.5, 3
-AHEAD = 3  # frames whose time stamps are looked at ahead: they outvote two wild ones in a row
 
 
 def _url(path: Path) -> str:
@@ -148,16 +54,15 @@ class Film(contextlib.AbstractContextManager["Film", None]):
     """Read a film: iterate over it for its frames. A context manager.
 
     Frames that cannot be decoded are left out, and `shortfall` says so, as it does where a film ends before the time in
-    its header. Frames decoded with errors are not noticed, nor are packets missing from the container, except in AVI,
-    whose header has the number of frames.
+    its header. Frames decoded with errors are not noticed, nor are packets missing from the container.
 
     Attributes:
         path: file of the film.
         size: (width, height) [px], of the picture as players turn it.
         rate_hz: mean frame rate [Hz].
         count: number of frames by the header; None if it has none.
-        number: number of the newest frame, from 0. Frames that cannot be decoded have numbers too, so that labels by
-            number stay valid for a damaged film.
+        number: number of the newest frame, from 0. Packets that cannot be decoded count as frames, so that labels by
+            number stay valid for a damaged film; beside one, B-frames may have their neighbours' numbers.
         shortfall: reason why frames are missing, known after the last frame; empty if the film is whole, or if that
             cannot be known.
     """
@@ -192,8 +97,6 @@ class Film(contextlib.AbstractContextManager["Film", None]):
         self.count: int | None = stream.frames or None
         self.number = -1
         self.shortfall = ""
-        self._damaged = False  # whether the newest decoded frame is
-        self._slots = 0  # end of what was read, in frames of the stream's own time
         self._end = 0.0  # end of what was read of pictures and sound, in the film's time [s]
 
     def __exit__(self, *_: object) -> None:
@@ -203,89 +106,70 @@ class Film(contextlib.AbstractContextManager["Film", None]):
     def __iter__(self) -> Iterator[Frame]:
         """Decode the frames in order; times are the film's own [s], or from the frame rate if it has none.
 
-        A wild time stamp is replaced, and a warning says so after the last frame: most of the next frames, or the end
-        in the film's header, go on from the time before it, and it is not between.
+        A wild time stamp, which is not between those of its neighbours, is replaced, and a warning says so.
 
         Raises:
             CotargetError: nothing can be decoded, or the image's size changes.
         """
-        places, self._slots = Places(self._container.streams.video[0]), 0
-        reason = ""
+        waiting: tuple[int, Frame] | None = None  # a frame and its number, until the next one is read
+        before = math.inf
+        for number, frame in self._decoded():
+            if waiting is not None:
+                self.number, read = waiting
+                if before < frame.t and not before <= read.t <= frame.t:
+                    log.warning("%s: the wild time stamp of frame %d is replaced", self.path, self.number)
+                    read = replace(read, t=(before + frame.t) / 2)
+                before = read.t
+                yield read
+            waiting = number, frame
+        if waiting is not None:
+            self.number, read = waiting
+            yield read
+
+    def _decoded(self) -> Iterator[tuple[int, Frame]]:
+        """Decode the frames with their numbers and the film's own times; then find out what is missing."""
+        number, refused, first, reason, failed = -1, 0, -1, "", ""
         try:
-            yield from self._mended(self._decoded(places))
+            for found in self._packets():
+                if isinstance(found, av.error.FFmpegError):
+                    reason, first = reason or f" ({reason_of(found)})", number + 1 if first < 0 else first
+                    number, refused = number + 1, refused + 1
+                    continue
+                number += 1
+                yield number, self._frame(found, number)
         except av.error.FFmpegError as error:
-            reason = f" ({reason_of(error)})"
-        if self.number < 0:
+            failed = f" ({reason_of(error)})"
+        if refused == number + 1:
             raise CotargetError(
-                f"{self.path}: holds no frame that can be decoded{reason or places.reason}; give a complete film"
+                f"{self.path}: holds no frame that can be decoded{failed or reason}; give a complete film"
             )
-        ending = self._shortfall() or (f"what follows cannot be decoded{reason}" if reason else "")
-        self.shortfall = "; ".join(filter(None, (places.describe(ended=bool(ending)), ending)))
+        lost = f"{refused} packet{'s' if refused > 1 else ''} from frame {first} on could not be decoded{reason}"
+        ending = self._shortfall() or (f"what follows cannot be decoded{failed}" if failed else "")
+        self.shortfall = "; ".join(filter(None, (lost if refused else "", ending)))
 
-    def _decoded(self, places: Places) -> Iterator[tuple[int, Frame]]:
-        """Decode the frames with their numbers and the film's own times."""
-        size = self.size
-        for picture in self._pictures(places):
-            image, self._damaged = picture.to_ndarray(format="bgr24"), picture.is_corrupt
-            if self._turns:
-                image = np.ascontiguousarray(np.rot90(image, self._turns))
-            if (image.shape[1], image.shape[0]) != size:
-                raise CotargetError(
-                    f"{self.path}: the picture's size changes from {size[0]}x{size[1]} to "
-                    f"{image.shape[1]}x{image.shape[0]} at frame {places.number}; cut the film there"
-                )
-            number = places.number
-            yield number, Frame(image, number / self.rate_hz if picture.time is None else float(picture.time))
+    def _frame(self, picture: av.VideoFrame, number: int) -> Frame:
+        """Convert a decoded picture; one without a time has that of the frame rate."""
+        image = np.ascontiguousarray(np.rot90(picture.to_ndarray(format="bgr24"), self._turns))
+        width, height = self.size
+        if image.shape[:2] != (height, width):
+            raise CotargetError(
+                f"{self.path}: the picture's size changes from {width}x{height} to "
+                f"{image.shape[1]}x{image.shape[0]} at frame {number}; cut the film there"
+            )
+        return Frame(image, number / self.rate_hz if picture.time is None else float(picture.time))
 
-    def _mended(self, frames: Iterator[tuple[int, Frame]]) -> Iterator[Frame]:
-        """Replace wild time stamps, see `__iter__`."""
-        waiting: deque[tuple[int, Frame]] = deque()
-        wild, end, failure = list[int](), list[float](), None
-        before, period = -math.inf, 1 / self.rate_hz
-        while True:
-            while failure is None and len(waiting) <= AHEAD:
-                try:
-                    waiting.append(next(frames))
-                except (StopIteration, CotargetError, av.error.FFmpegError) as error:
-                    failure = error
-                    if isinstance(error, StopIteration) and (stated := sum(self._stated())):
-                        end = AHEAD * [stated + max(SHORT_S, SHORT_FRAMES * period)]
-            if not waiting:
-                break
-            self.number, frame = waiting.popleft()
-            after = ([each.t for _, each in waiting] + end)[:AHEAD]
-            against = [i for i, t in enumerate(after, 1) if before < t and not before <= frame.t <= t]
-            if against and 2 * len(against) >= len(after):
-                wild.append(self.number)
-                i, t = against[0], after[against[0] - 1]
-                mended = t - i * period if math.isinf(before) else before + min(period, (t - before) / (i + 1))
-                frame = replace(frame, t=mended)
-            before = frame.t
-            yield frame
-        if wild:
-            log.warning("%s: wild time stamps, replaced: %d, the first at frame %d", self.path, len(wild), wild[0])
-        if failure is not None and not isinstance(failure, StopIteration):
-            raise failure
-
-    def _pictures(self, places: Places) -> Iterator[av.VideoFrame]:
-        """Decode the first video stream; packets of all streams are read to find their end."""
+    def _packets(self) -> Iterator[av.VideoFrame | av.error.FFmpegError]:
+        """Decode the first video stream, packet by packet; packets of all streams are read to find their end."""
         pictures = self._container.streams.video[0]
         for packet in self._container.demux():
             if packet.pts is not None and packet.time_base is not None:
                 self._end = max(self._end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
-            if packet.stream is pictures and packet.dts is not None:
-                self._slots = max(self._slots, packet.dts + (packet.duration or 1))
             # An empty packet repeats the frame before it; the very last one has no time and flushes the decoder.
             if packet.stream is pictures and (packet.size or packet.dts is None):
-                places.expect(packet)
                 try:
-                    decoded = cast(list[av.VideoFrame], packet.decode())
+                    yield from cast(list[av.VideoFrame], packet.decode())
                 except av.error.FFmpegError as error:
-                    places.refuse(error)
-                    continue
-                for picture in decoded:
-                    places.take(picture)
-                    yield picture
+                    yield error
 
     def _stated(self) -> tuple[float, float]:
         """Begin and duration of the film by its header [s]; 0 where it has none."""
@@ -300,16 +184,11 @@ class Film(contextlib.AbstractContextManager["Film", None]):
         return begin, stated
 
     def _shortfall(self) -> str:
-        """Describe what the container states beyond what was read, or that the last frame is damaged."""
-        stream, container = self._container.streams.video[0], self._container
+        """Describe what the header states beyond what was read; empty if nothing."""
         begin, stated = self._stated()
-        if begin + stated - self._end > max(SHORT_S, SHORT_FRAMES / self.rate_hz):
-            return f"the film says that it lasts {stated:.1f} s, and ends at {max(self._end - begin, 0.0):.1f} s"
-        # In AVI every frame is a slot of its time, even an empty one; a lost frame makes the others come too early.
-        if container.format.name == "avi" and (lost := stream.frames - self._slots) > 0:
-            stated_count = f"of the {stream.frames} frames that it says it has {lost} are lost"
-            return f"{stated_count}, and those after them come too early"
-        return "its last frame is damaged" if self._damaged else ""
+        if begin + stated - self._end <= max(SHORT_S, SHORT_FRAMES / self.rate_hz):
+            return ""
+        return f"the film says that it lasts {stated:.1f} s, and ends at {max(self._end - begin, 0.0):.1f} s"
 
 
 QUALITY, PRESET = "20", "veryfast"  # of x264; see docs/design-notes.md
@@ -347,13 +226,12 @@ class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
         self._path, self._keep = path, keep
         self.epoch: datetime | None = None
         self._part = PartFile(path)
-        self._file = _FilmFile(self._part)
         self._rate = Fraction(rate_hz).limit_denominator(1001 * 30)
         self._stream: av.VideoStream | None = None
         self._begin, self._last = 0.0, -TICKS_HZ
         try:
             options = FRAGMENTS if path.suffix.lower() in FRAGMENTED else {}
-            self._container = av.open(self._file, "w", options=options)
+            self._container = av.open(_url(self._part.path), "w", options=options)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             with self._part.ending(keep=False):
                 raise self._said(error) from None
@@ -372,20 +250,17 @@ class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
         if height % 2 or width % 2:
             image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE).astype(np.uint8)
         try:
-            with deferred_signals():  # an exception while the file is written would be lost in FFmpeg
-                if self._stream is None:
-                    self._stream, self._begin = self._begun(image, t), t
-                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
-                tick = self._stream.codec_context.time_base
-                assert tick is not None
-                least = max(1, round(LEAST_S / tick))
-                self._last = max(self._last + least, round((t - self._begin) / tick))  # a clock may jump back
-                picture.pts, picture.time_base, picture.duration = self._last, tick, round(1 / self._rate / tick)
-                self._container.mux(self._stream.encode(picture))
+            if self._stream is None:
+                self._stream, self._begin = self._begun(image, t), t
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
+            tick = self._stream.codec_context.time_base
+            assert tick is not None
+            least = max(1, round(LEAST_S / tick))
+            self._last = max(self._last + least, round((t - self._begin) / tick))  # a clock may jump back
+            picture.pts, picture.time_base, picture.duration = self._last, tick, round(1 / self._rate / tick)
+            self._container.mux(self._stream.encode(picture))
         except (av.error.FFmpegError, ValueError) as error:
-            self._file.refuse(error)
-        if self._file.failure is not None:
-            raise self._said(self._file.failure)
+            raise self._said(error) from None
 
     def _begun(self, image: Image, t: float) -> av.VideoStream:
         """Add the stream for images of this size."""
@@ -408,88 +283,18 @@ class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
         Raises:
             CotargetError: the film could not be completed, for example on a full disk.
         """
-        keep = self._stream is not None and (error is None or self._keep)
+        keep, failure = self._stream is not None and (error is None or self._keep), None
         with self._part.ending(keep=keep, error=error):
             try:
-                if keep and self._stream is not None and self._file.failure is None:
+                if keep and self._stream is not None:
                     self._container.mux(self._stream.encode(None))
                 self._container.close()
-            except (av.error.FFmpegError, OSError) as failed:
-                self._file.refuse(failed)
-            finally:
+            except (av.error.FFmpegError, OSError) as failed:  # FFmpeg writes nothing more after a full disk
+                failure = failed
                 with contextlib.suppress(av.error.FFmpegError, OSError):
                     self._container.close()
-                self._file.close()
-            failure = self._file.failure
-            if keep and failure is not None and not _can_be_played(self._part.path):
-                raise CotargetError(f"{self._path}: cannot be completed ({reason_of(failure)})")
         if error is None and failure is not None:
             raise CotargetError(f"{self._path}: is cut short ({reason_of(failure)}); holds what there was until then")
-
-
-def _can_be_played(path: Path) -> bool:
-    """Check whether a film has a frame that can be decoded."""
-    try:
-        with Film(path) as film:
-            return next(iter(film), None) is not None
-    except CotargetError:
-        return False
-
-
-class _FilmFile:
-    """File of a film in the making, which can be played up to where the disk was full.
-
-    FFmpeg completes a film by overwriting its beginning. That is done when the file is closed, and only if everything
-    else could be written; after a failure nothing more is written.
-
-    Attributes:
-        name: path of the file, by which FFmpeg chooses the container.
-        failure: the first error; None if there was none.
-    """
-
-    def __init__(self, part: PartFile) -> None:
-        self.name = str(part.path)
-        self.failure: Exception | None = None
-        self._file = part.file
-        self._at = self._size = 0
-        self._overwritten: list[tuple[int, bytes]] = []
-
-    def refuse(self, error: Exception) -> None:
-        """Write nothing more because of an error."""
-        self.failure = self.failure or error
-
-    def write(self, data: bytes) -> int:
-        """Append data; keep what overwrites earlier data for the end."""
-        data = bytes(data)
-        inside = min(len(data), self._size - self._at)
-        if inside:
-            self._overwritten.append((self._at, data[:inside]))
-        if len(data) > inside and self.failure is None:
-            try:
-                write_all(self._file, data[inside:])
-            except OSError as error:
-                self.refuse(error)
-                self._file.truncate(self._size)
-        self._at += len(data)
-        self._size = max(self._size, self._at)
-        return len(data)
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to a place of the file, as it would be without failures."""
-        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
-        return self._at
-
-    def tell(self) -> int:
-        """Return the place in the file."""
-        return self._at
-
-    def close(self) -> None:
-        """Write what overwrites earlier data, and close the file."""
-        with self._file:
-            if self.failure is None:
-                for at, data in self._overwritten:
-                    self._file.seek(at)
-                    write_all(self._file, data)
 
 
 def join_films(parts: Sequence[Path], path: Path) -> None:
