@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
@@ -16,8 +17,7 @@ from cotarget.errors import CotargetError
 Result = TypeVar("Result")
 # Called with the amount done, the total (None if it is unknown), and a text.
 Progress = Callable[[float, float | None, str], object]
-LONGEST_LINE = 79  # of a terminal, which would wrap a longer one
-CLEAR = "\r\x1b[K"  # erases a terminal's line
+PROGRESS_LINE_S = 30.0  # interval of lines of progress where stderr is not a terminal [s]
 ORPHANED = 1  # exit status of a process whose parent has ended
 # Parameters of glibc's mallopt: one arena for all threads, and a separate mapping for each block of at least MAPPED
 # bytes, whose memory is free when the block is. The demo then needs 470 to 520 MB in place of 570.
@@ -26,21 +26,41 @@ MAPPED = 262144
 
 
 @contextlib.contextmanager
-def progress_line(given: Progress | None) -> Iterator[Progress]:
-    """Show progress as a user wants it; by default as a line of stderr, erased in the end, if that is a terminal."""
+def progress_bar(given: Progress | None = None, now: Callable[[], float] = time.monotonic) -> Iterator[Progress]:
+    """Show progress as a user wants it; by default on stderr, by a bar on a terminal, otherwise an occasional line."""
+    if given is not None or not sys.stderr.isatty():
+        yield given or _progress_lines(now)
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
 
-    def write(text: str) -> None:
-        with contextlib.suppress(OSError):  # a closed terminal does not end the work
-            sys.stderr.write(CLEAR + text[:LONGEST_LINE])
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
+    # Results go to stdout, past the bar.
+    with Bar(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bar:
+        task = bar.add_task("", total=None)
+
+        def show(done: float, total: float | None, text: str) -> None:
+            bar.update(task, description=text, completed=done if total is None else min(done, total), total=total)
+
+        yield show
+
+
+def _progress_lines(now: Callable[[], float]) -> Progress:
+    """Make a function that writes a line half a minute after the one before; short work writes nothing."""
+    begin = last = now()
+
+    def show(done: float, total: float | None, text: str) -> None:
+        nonlocal last
+        if (t := now()) - last < PROGRESS_LINE_S:
+            return
+        last = t
+        with contextlib.suppress(OSError):  # the reader of stderr may be closed; the work goes on
+            part = "" if total is None else f"{100 * min(done / max(total, 1), 1):.0f} %, "
+            sys.stderr.write(f"{text} ({part}{t - begin:.0f} s)\n")
             sys.stderr.flush()
 
-    if given is not None or not sys.stderr.isatty():
-        yield given or (lambda *_: None)
-        return
-    try:
-        yield lambda done, total, text: write(f"{100 * done / total:.0f} % {text}" if total else text)
-    finally:
-        write("")
+    return show
 
 
 def run_apart(job: Callable[..., Result], arguments: tuple[Any, ...], report: Callable[..., object]) -> Result:

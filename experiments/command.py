@@ -17,9 +17,10 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from cotarget.cli.common import progress_bar, whole
+from cotarget.cli.common import whole
 from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError, choices
+from cotarget.parallel import progress_bar
 from cotarget.plugins import is_own
 from cotarget.schema import validate
 from experiments.engine import (

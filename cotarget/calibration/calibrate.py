@@ -48,7 +48,7 @@ from cotarget.calibration.zoom_samples import (
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array
-from cotarget.parallel import Progress, progress_line
+from cotarget.parallel import Progress, progress_bar
 from cotarget.rig import Rig, opened_from
 
 log = logging.getLogger(__name__)
@@ -349,7 +349,7 @@ def _calibrate_images(
     for camera in CAMERAS:
         if not any(capture.camera == camera for capture in index.captures):
             raise CalibrationError(f"{directory}: has no capture of the {camera} camera; both cameras are needed")
-    with progress_line(progress) as show:
+    with progress_bar(progress) as show:
         views, unusable, sizes = find_views(directory, index, show, options)
         show(len(index.captures), len(index.captures), "fitting")
         return calibrate_views(
@@ -394,8 +394,7 @@ def calibrate(
         rig: rig to calibrate; no earlier calibration is needed.
         board: the board in use; None for that of the rig's configuration.
         captures_dir: folder for the images; None to keep none.
-        progress: called with the number done, the total, and a text; by default a line on stderr, if that is a
-            terminal.
+        progress: called with the number done, the total, and a text; by default it is shown on stderr.
         placements: number of placements of the board at the shortest focal length, at least 7.
         stops: number of zoom samples, evenly spread over the logarithm of the lens's range, and more where they would
             be too far apart; 1 for the shortest alone.
@@ -420,7 +419,7 @@ def calibrate(
         "far_placements": far_placements,
         "focal_range_px": [float(focal) for focal in rig.zoom.focal_range],
     }
-    with progress_line(progress) as show:
+    with progress_bar(progress) as show:
         capture_session(recorder, placements, rng, show, stops=stops, far_placements=far_placements)
         return calibrate_views(
             recorder.views,

@@ -20,11 +20,11 @@ from cotarget.cli.common import (
     positive,
     previous_kept,
     print_json,
-    progress_bar,
     rig_files,
     whole,
 )
 from cotarget.errors import CalibrationError, ConfigError
+from cotarget.parallel import progress_bar
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration

@@ -1,7 +1,6 @@
-"""Parts that the commands share: argument types, checks of inputs and outputs, progress, JSON output."""
+"""Parts that the commands share: argument types, checks of inputs and outputs, JSON output."""
 
 import argparse
-import contextlib
 import dataclasses
 import itertools
 import json
@@ -9,8 +8,6 @@ import math
 import os
 import sys
 import tempfile
-import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +19,6 @@ from cotarget.files import STDOUT, behind_link, write_atomically
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig
-    from cotarget.parallel import Progress
     from cotarget.rig import Rig, RigSpec
     from cotarget.track_metrics import Criterion, Label, Tracked
 
@@ -73,63 +69,7 @@ def check_board_size(rig: Path, config: "RigConfig") -> None:
     check_square(config.board.square, f"{rig}: board.square")
 
 
-# Progress and results
-
-PROGRESS_LINE_S = 30.0  # interval of lines of progress where stderr is not a terminal [s]
-REPEAT_S = 0.5  # interval at which it is seen whether a step takes that long [s]
-
-
-@contextmanager
-def progress_bar(now: Callable[[], float] = time.monotonic) -> "Iterator[Progress]":
-    """Show progress on stderr: a bar on a terminal, otherwise an occasional line."""
-    if not sys.stderr.isatty():
-        with _progress_lines(now) as show_line:
-            yield show_line
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    columns = TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
-    # Results go to stdout, past the bar.
-    with Bar(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bar:
-        task = bar.add_task("", total=None)
-
-        def show(done: float, total: float | None, text: str) -> None:
-            bar.update(task, description=text, completed=done if total is None else min(done, total), total=total)
-
-        yield show
-
-
-@contextmanager
-def _progress_lines(now: Callable[[], float]) -> "Iterator[Progress]":
-    """Print progress as a line every half a minute, also in a long step; short work prints nothing."""
-    begin = last = now()
-    newest: tuple[float, float | None, str] | None = None
-    ended = threading.Event()
-
-    def show(done: float, total: float | None, text: str) -> None:
-        nonlocal last, newest
-        newest = done, total, text
-        if (t := now()) - last < PROGRESS_LINE_S:
-            return
-        last = t
-        with contextlib.suppress(OSError):  # the reader of stderr may be closed; the work goes on
-            part = "" if total is None else f"{100 * min(done / max(total, 1), 1):.0f} %, "
-            print(f"{text} ({part}{t - begin:.0f} s)", file=sys.stderr, flush=True)
-
-    def repeat() -> None:
-        while not ended.wait(REPEAT_S):
-            if newest is not None:
-                show(*newest)
-
-    repeating = threading.Thread(target=repeat, name="progress", daemon=True)
-    repeating.start()
-    try:
-        yield show
-    finally:
-        ended.set()
-        repeating.join()
+# Results
 
 
 def print_json(table: Any, csv: Path | None = None) -> None:
@@ -238,15 +178,12 @@ def previous_kept(path: Path) -> Iterator[None]:
 
 
 def _second_name(path: Path) -> Path | None:
-    """Link a file to another name beside its own; None where there is no such file."""
+    """Copy a file under another name beside its own; None where there is no such file."""
     if not path.exists():
         return None
     numbered = (path.with_name(f"{path.stem}.previous-{n}{path.suffix}") for n in itertools.count(1))
     kept = next(name for name in numbered if not os.path.lexists(name))
-    try:
-        os.link(path, kept)
-    except OSError:  # not every file system has hard links
-        write_atomically(kept, path.read_bytes())
+    write_atomically(kept, path.read_bytes())
     return kept
 
 

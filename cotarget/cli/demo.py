@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from cotarget.cli.common import add_file, previous_kept, progress_bar, whole
+from cotarget.cli.common import add_file, previous_kept, whole
+from cotarget.parallel import progress_bar
 
 
 def add(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,6 @@ from cotarget.cli.common import (
     check_outputs,
     length,
     print_json,
-    progress_bar,
     ratio,
     rig_files,
     scores_of,
@@ -19,6 +18,7 @@ from cotarget.cli.common import (
 )
 from cotarget.errors import ConfigError, naming
 from cotarget.files import STDOUT
+from cotarget.parallel import progress_bar
 
 if TYPE_CHECKING:
     from cotarget.config import TargetProfile

@@ -5,7 +5,6 @@ status.
 """
 
 import argparse
-import codecs
 import contextlib
 import io
 import logging
@@ -40,15 +39,6 @@ class Parser(argparse.ArgumentParser):
             self.epilog = self.make_epilog()
         return super().format_help() + (f"\nexample: {self.example}\n" if self.example else "")
 
-    def _print_message(self, message: str, file: Any = None) -> None:
-        """Print a help text or an error, which argparse does too; exit with status 1 where stdout does not take it."""
-        file = file or sys.stderr
-        try:
-            print(message, end="", file=file, flush=True)
-        except OSError as error:
-            if file is sys.stdout:
-                self.exit(1, "" if isinstance(error, BrokenPipeError) else f"{self.prog}: {error.strerror or error}\n")
-
     def error(self, message: str) -> NoReturn:
         """Exit with one line on stderr, without the usage."""
         self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
@@ -76,9 +66,8 @@ ONE_THREAD = ("OMP_NUM_THREADS", "1")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit status."""
     os.environ.setdefault(*ONE_THREAD)
-    codecs.register_error(AS_GIVEN, _encode_as_given)
-    for descriptor, name in enumerate(("stdout", "stderr"), start=1):
-        _prepare(descriptor, name)
+    for name in ("stdout", "stderr"):
+        _prepare(name)
     try:
         return _run(make_parser().parse_args(arguments))
     finally:
@@ -122,33 +111,14 @@ def _run(options: argparse.Namespace) -> int:
 
 # Standard streams
 
-AS_GIVEN = "cotarget.as_given"  # name of `_encode_as_given` for codecs
 
-
-def _encode_as_given(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Encode what the locale cannot: bytes of a name or an argument as they were given, others with a backslash."""
-    try:
-        return codecs.lookup_error("surrogateescape")(error)
-    except UnicodeError:
-        return codecs.lookup_error("backslashreplace")(error)
-
-
-class ClosedStdout(io.TextIOBase):
-    """Stdout that was closed: what is printed fails, as on a full disk."""
-
-    def write(self, text: str) -> int:
-        """Refuse a text."""
-        raise OSError("stdout is closed")
-
-
-def _prepare(descriptor: int, name: str) -> None:
+def _prepare(name: str) -> None:
     """Let a standard stream write any name; replace a closed one, whose descriptor the next file would get."""
     stream = getattr(sys, name)
     if stream is None:
-        _open_nothing(descriptor)
-        setattr(sys, name, ClosedStdout() if name == "stdout" else os.fdopen(descriptor, "w", closefd=False))
+        setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115  open until the program ends
     elif isinstance(stream, io.TextIOWrapper):
-        stream.reconfigure(errors=AS_GIVEN)
+        stream.reconfigure(errors="backslashreplace")
 
 
 def _drop_unwritten(stream: IO[str]) -> None:
@@ -156,15 +126,7 @@ def _drop_unwritten(stream: IO[str]) -> None:
     try:
         stream.flush()
     except OSError:
-        with contextlib.suppress(OSError):  # without a descriptor there is nothing that Python flushes
-            _open_nothing(stream.fileno())
-
-
-def _open_nothing(descriptor: int) -> None:
-    nothing = os.open(os.devnull, os.O_RDWR)
-    if nothing != descriptor:
-        os.dup2(nothing, descriptor)
-        os.close(nothing)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 class StderrHandler(logging.Handler):

@@ -16,9 +16,10 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from cotarget.cli.common import add_file, number, progress_bar, whole
+from cotarget.cli.common import add_file, number, whole
 from cotarget.errors import ConfigError, choices
 from cotarget.files import STDOUT, CsvFile
+from cotarget.parallel import progress_bar
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration

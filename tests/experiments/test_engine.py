@@ -45,7 +45,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture
 def run(tmp_path, capsys, monkeypatch):
     """The command on tiny experiments, in this process; exit status, what it said, and what it complained of."""
-    monkeypatch.setattr("cotarget.cli.common.PROGRESS_LINE_S", math.inf)  # a busy machine is no complaint
+    monkeypatch.setattr("cotarget.parallel.PROGRESS_LINE_S", math.inf)  # a busy machine is no complaint
 
     def typed(*arguments, out="out", known=KNOWN, apart=here):
         status = main([*arguments, "--out", str(tmp_path / out)], known, tmp_path, here_together, apart)

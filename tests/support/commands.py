@@ -31,7 +31,7 @@ port = "usb:"
 
 def call(capsys, *arguments):
     """Exit status, stdout and stderr of a command."""
-    with patch("cotarget.cli.common.PROGRESS_LINE_S", math.inf):  # a busy machine is no complaint
+    with patch("cotarget.parallel.PROGRESS_LINE_S", math.inf):  # a busy machine is no complaint
         try:
             status = cli.main([str(a) for a in arguments])
         except SystemExit as left:
