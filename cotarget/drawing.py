@@ -37,9 +37,9 @@ def aim_error_figure(rows: Mapping[str, Sequence[Row]]) -> Figure:
     FigureCanvasAgg(figure)
     for ax, (name, run) in zip(np.atleast_1d(figure.subplots(len(rows), 1)), rows.items(), strict=True):
         t = np.array([row.t_s for row in run])
-        offset = np.array([100 * row.tpo_px / row.width_px if row.inside else np.nan for row in run])
+        offset = np.array([100 * row.closeup.tpo_px / row.width_px if row.closeup.inside else np.nan for row in run])
         ax.plot(t, offset, lw=1.2, color=OFFSET, label="offset from the centre of the zoom image")
-        out = np.array([not row.in_frame and row.in_wide for row in run])
+        out = np.array([not row.closeup.in_frame and row.in_wide for row in run])
         missed = "seen by the fixed camera, not in the close-up"
         ax.fill_between(t, 0, 50, where=out, color="#d9534f", alpha=0.15, lw=0, label=missed)
         ax.set(ylim=(0, 50), xlim=(t[0], t[-1]), ylabel="offset [% of width]", title=name)

@@ -1,7 +1,7 @@
 """Evaluate Steps and calibrations by the simulation's ground truth, which the pipeline cannot see.
 
-`observe` and `pointing_errors` evaluate. `TruthDetector`, `TruthFinder` and `true_calibration` replace detector,
-registration and calibration by the truth with noise, for runs that need neither rendering nor boards.
+`observe` and `pointing_errors` evaluate. `TruthDetector` and `true_calibration` replace detector and calibration
+by the truth with noise, for runs that need neither rendering nor boards.
 """
 
 import dataclasses
@@ -18,14 +18,11 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import TargetProfile, split_name
 from cotarget.detection import Detections
 from cotarget.errors import ConfigError, UnreachableError
-from cotarget.estimation.measurement_model import Pose
-from cotarget.estimation.motion_model import GATE
-from cotarget.estimation.zoom_matching import CloseupFinder, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.pantilt import HeadGeometry
 from cotarget.pipeline import Step
-from cotarget.rig import Detection, Frame, Image, to_step
+from cotarget.rig import Detection, Frame, to_step
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.targets import KINDS
 from cotarget.sim.targets.target import marker_of
@@ -56,8 +53,6 @@ def true_calibration(world: SimWorld, stops: int = 8) -> Calibration:
     )
 
 
-# Distance of seeds, so that the errors of detector and finder are independent.
-FINDER_SEED = 1 << 33
 # Gives the random numbers of a time [s]; draw them before those of another time are requested.
 NumbersAt = Callable[[float], np.random.Generator]
 
@@ -148,49 +143,6 @@ class TruthDetector:
                 continue
             found.append(Detection(np.array(middle), np.array(sides), 1.0, clipped))
         return Detections(sorted(found, key=lambda detection: -math.prod(detection.size_px.tolist())))
-
-
-class TruthFinder:
-    """Find a target in the zoom image by ground truth with noise, for `FollowSettings.finder`.
-
-    Like the real finder it gives the body's centre, if that is where it is expected. Occlusion is not considered.
-    """
-
-    SIGMA_PX = 1.0  # of the noise; the real finder assumes as much for lens, head and frame times
-
-    def __init__(
-        self,
-        calibration: Calibration,
-        target: TargetProfile,
-        truth: Appearances,
-        name: str,
-        seed: int,
-        missed: Callable[[float], bool] = lambda t: False,
-    ) -> None:
-        """Create a finder of the target ``name``, which fails in frames whose exposure times [s] are ``missed``."""
-        self._map = CloseupFinder(calibration, target).affine_map
-        self._truth, self._name, self._missed = truth, name, missed
-        self._numbers_at = counted(seed + FINDER_SEED)
-
-    def store(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
-        """Do nothing: the ground truth is always known."""
-
-    def fixed_view_at(self, t: float) -> bool:
-        """Return True: the ground truth is known at any time."""
-        return True
-
-    def find(self, frame: Frame, x_fixed: Array, covariance: Array, pose: Pose) -> ZoomMeasurement | None:
-        """Find the target; None if its centre is outside the frame or outside the gate."""
-        A, box = self._map(x_fixed, pose), self._truth.box(self._name, "zoom", frame.t)
-        if A is None or box is None or self._missed(frame.t):
-            return None
-        noise = self.SIGMA_PX * self._numbers_at(frame.t).normal(size=2)
-        at = self._truth.center_px(self._name, "zoom", frame.t) + noise
-        off = at - A[:, 2]
-        inside = (at >= 0).all() and (at <= np.array(frame.image.shape[1::-1]) - 1).all()
-        if not inside or off @ np.linalg.solve(covariance, off) > GATE:
-            return None
-        return ZoomMeasurement(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), frame.t)
 
 
 # Depths of the targets for which pointing errors are stated, over the whole fixed image [m].

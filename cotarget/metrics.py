@@ -150,34 +150,9 @@ class Row:
         return Closeup(self.u_px, self.v_px, self.width_px, self.height_px, self.size_px, self.wanted_px, self.visible)
 
     @property
-    def inside(self) -> bool:
-        """Whether the body centre is inside the zoom image."""
-        return self.closeup.inside
-
-    @property
-    def size_ratio(self) -> float:
-        """True size over the wanted size; 0 for a target behind the camera."""
-        return self.closeup.size_ratio
-
-    @property
-    def in_frame(self) -> bool:
-        """Whether the target is in frame."""
-        return self.closeup.in_frame
-
-    @property
-    def good_closeup(self) -> bool:
-        """Whether the whole target is visible at about the wanted size."""
-        return self.closeup.good
-
-    @property
-    def tpo_px(self) -> float:
-        """Target point offset: distance from the image's centre; half the diagonal if the target is not inside [px]."""
-        return self.closeup.tpo_px
-
-    @property
     def tpo_deg(self) -> float:
         """Target point offset as an angle [degrees]."""
-        return math.degrees(math.atan(self.tpo_px / self.focal_px))
+        return math.degrees(math.atan(self.closeup.tpo_px / self.focal_px))
 
     @property
     def tpe_px(self) -> float:
@@ -301,12 +276,12 @@ def score(rows: Sequence[Row]) -> Score:
     return Score(
         frames=len(counted),
         time_to_acquire_s=after[0].t_s - counted[0].t_s if after else None,
-        closeup_yield=float(np.mean([r.good_closeup for r in counted])),
-        in_frame_ratio=float(np.mean([r.in_frame for r in after])) if after else None,
-        tpo_px_median=median(r.tpo_px for r in after),
-        tpo_width_median=median(r.tpo_px / r.width_px for r in after),
+        closeup_yield=float(np.mean([r.closeup.good for r in counted])),
+        in_frame_ratio=float(np.mean([r.closeup.in_frame for r in after])) if after else None,
+        tpo_px_median=median(r.closeup.tpo_px for r in after),
+        tpo_width_median=median(r.closeup.tpo_px / r.width_px for r in after),
         tpo_deg_median=median(r.tpo_deg for r in after),
-        size_ratio_median=median(r.size_ratio for r in after),
+        size_ratio_median=median(r.closeup.size_ratio for r in after),
         wanted_px=median(r.wanted_px for r in counted),
         range_m=median(r.range_m for r in counted),
         tpe_px_median=median(r.tpe_px for r in counted),
@@ -325,7 +300,7 @@ def _acquired(rows: Sequence[Row]) -> int | None:
     """Index of the first row of the first half second in frame without a break."""
     begin: int | None = None
     for i, row in enumerate(rows):
-        if not row.in_frame:
+        if not row.closeup.in_frame:
             begin = None
         else:
             begin = i if begin is None else begin
@@ -343,7 +318,7 @@ def _breaks(rows: Sequence[Row]) -> int:
     """Count the times for which the target was out of frame for more than 0.2 s."""
     breaks, since = 0, None
     for row in rows:
-        if row.in_frame:
+        if row.closeup.in_frame:
             breaks += since is not None and row.t_s - since > BREAK_S + ROUNDING_S
             since = None
         elif since is None:

@@ -1,11 +1,9 @@
 """The demo: results that appear together or not at all, and (slow) the figures that it reaches."""
 
 import json
-import os
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -50,15 +48,6 @@ def test_a_failed_run_leaves_the_old_files_and_no_others(tmp_path, error):
     with pytest.raises(type(error)):
         fail_half_way()
     assert contents(tmp_path) == {"metrics.json": "old"}
-
-
-def test_folders_of_killed_runs_are_removed_an_hour_later(tmp_path):
-    for name, age_s in ((".unfinished-old", 3700), (".unfinished-new", 3500)):
-        (tmp_path / name).mkdir()
-        os.utime(tmp_path / name, (time.time() - age_s,) * 2)
-    with finished_together(tmp_path):
-        pass
-    assert [path.name for path in tmp_path.iterdir()] == [".unfinished-new"]
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):

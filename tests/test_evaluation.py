@@ -155,7 +155,7 @@ def test_a_row_holds_the_truth_and_the_commands(book):
     assert row.in_wide
     assert row.track == -1
     assert row.focal_px == pytest.approx(692)
-    assert not row.in_frame  # it is a tenth as large as wanted
+    assert not row.closeup.in_frame  # it is a tenth as large as wanted
     assert math.isnan(row.tpe_px)
     assert (row.decoded, row.decoded_wide) == (False, False)  # its marker is 5 px large
     assert row.off_target == ""

@@ -157,7 +157,7 @@ def test_never_acquired_and_never_there():
 ])  # fmt: skip
 def test_in_frame_and_good_closeup(change, in_frame, good):
     row = dataclasses.replace(GOOD, **change)
-    assert (row.in_frame, row.good_closeup) == (in_frame, good)
+    assert (row.closeup.in_frame, row.closeup.good) == (in_frame, good)
 
 
 def test_target_point_offset():

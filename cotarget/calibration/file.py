@@ -12,7 +12,6 @@ starts from exactly the same numbers.
 import itertools
 import json
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -101,8 +100,7 @@ class Calibration:
         path = Path(path)
         table = read_object(path, WANTED)
         if not (table.keys() & OWN_KEYS):
-            what = next((f", but {what}" for keys, what in OTHERS if table.keys() >= keys), "")
-            raise CalibrationError(f"{path}: is no calibration{what}; {WANTED}")
+            raise CalibrationError(f"{path}: is no calibration; {WANTED}")
         check_schema(path, table, SCHEMA)
         try:
             return validate(CalibrationTable, table, "").calibration()
@@ -138,18 +136,10 @@ def read_object(path: Path, wanted: str) -> Table:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise CalibrationError(f"{path}: cannot be read: {reason}") from None
     except (json.JSONDecodeError, RecursionError) as error:
-        what = "is empty" if not text.strip() else "is TOML" if _is_toml(text) else f"is not JSON: {error}"
-        raise CalibrationError(f"{path}: {what}; {wanted}") from None
+        raise CalibrationError(f"{path}: is not JSON: {error}; {wanted}") from None
     if not isinstance(table, dict):
         raise CalibrationError(f"{path}: holds no JSON object; {wanted}")
     return table
-
-
-def _is_toml(text: str) -> bool:
-    try:
-        return bool(tomllib.loads(text))
-    except (tomllib.TOMLDecodeError, RecursionError):
-        return False
 
 
 def check_schema(path: Path, table: Table, schema: int) -> None:
@@ -379,10 +369,6 @@ def check_covariance(covariance: Covariance, stops: int) -> None:
 SCHEMA = 2
 OWN_KEYS = {"fixed", "zoom", "T_zoom0_fixed"}  # a calibration of any version has at least one of these
 WANTED = "give a calibration.json, as cotarget calibrate writes it"
-OTHERS = (
-    ({"captures", "board"}, "the index of captures: cotarget calibrate --from its folder makes one of them"),
-    ({"versions", "config"}, "the description of a capture session or a recording"),
-)
 
 
 def _table(calibration: Calibration) -> CalibrationTable:

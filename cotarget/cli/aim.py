@@ -12,11 +12,10 @@ from cotarget.errors import ConfigError, naming
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig, TargetProfile
-    from cotarget.targeting import Aim, WantedSize
+    from cotarget.targeting import Aim
 
 
 LEAST_SEEN_PX = 1.0  # size of a target in the fixed image that no detector finds; it was given in millimetres
-SMALL_PX = 10.0  # smaller sizes are printed with two digits, others as whole pixels
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -80,8 +79,6 @@ def run(options: argparse.Namespace) -> None:
     is_calibrated = _check_focal_length(calibration, found)
     targets = config.targets if target is None else {options.target: target}
     is_plausible = _check_depth(options, calibration, found, targets)
-    if wanted is not None and found.limited:
-        _check_shown_size(calibration, found, wanted, options.target)
     print_json(
         {
             "pan_deg": math.degrees(found.pan),
@@ -140,14 +137,6 @@ def _check_depth(
     return False
 
 
-def _check_shown_size(calibration: "Calibration", found: "Aim", wanted: "WantedSize", name: str) -> None:
-    """Warn if the lens shows the target at another size than wanted, in whole pixels or two digits."""
-    focal = calibration.zoom_head.lens.at(found.nominal_px).focal_px[int(wanted.vertical)]
-    shown_px, wanted_px = _pixels(focal * wanted.size / found.range), _pixels(wanted.wanted_px)
-    if shown_px != wanted_px:
-        _warn(f"the lens shows the {name} {shown_px} px large there, and not {wanted_px}")
-
-
 def _target(options: argparse.Namespace, config: "RigConfig", calibration: "Calibration") -> "TargetProfile | None":
     """Look up the target of --target, and check the options that need it."""
     from cotarget.targeting import size_implausibility
@@ -188,7 +177,3 @@ def _depth(options: argparse.Namespace, target: "TargetProfile", calibration: "C
 
 def _warn(text: str) -> None:
     print(f"cotarget aim: {text}", file=sys.stderr)
-
-
-def _pixels(size: float) -> str:
-    return f"{size:.2g}" if size < SMALL_PX else f"{size:.0f}"

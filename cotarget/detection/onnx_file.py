@@ -16,8 +16,6 @@ from cotarget.errors import ConfigError, install_extra
 from cotarget.geometry import Array
 
 FLOAT32 = 1  # in onnx.proto
-LARGEST_PX = 8192
-LONGEST_VARINT = 10  # [bytes]
 
 Outputs = Mapping[str, Array]
 Run = Callable[[Array], Outputs]
@@ -172,8 +170,6 @@ def _size(path: Path, image: _Input, wanted: tuple[int, int] | None) -> tuple[in
     if any(own not in (0, n) for own, n in zip((width, height), size, strict=True)):
         takes = " x ".join(str(n or "any") for n in (width, height))
         raise ConfigError(f"{path}: takes images of {takes} px; correct network.input_px")
-    if max(size) > LARGEST_PX:
-        raise ConfigError(f"{path}: an input of {size[0]} x {size[1]} px is too large; at most {LARGEST_PX} each")
     return size
 
 
@@ -220,10 +216,10 @@ def _fields(message: memoryview, number: int) -> Iterator[Any]:
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
     """Read an integer of seven bits a byte; return it, and where the next field begins."""
-    value = 0
-    for i in range(LONGEST_VARINT):
-        byte = message[at + i]
-        value |= (byte & 0x7F) << 7 * i
+    value = shift = 0
+    while True:
+        byte = message[at]
+        value |= (byte & 0x7F) << shift
+        at, shift = at + 1, shift + 7
         if byte < 0x80:
-            return value, at + i + 1
-    raise ValueError(at)
+            return value, at

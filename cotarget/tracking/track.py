@@ -332,18 +332,14 @@ BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
 }
 
 
-def tracking_settings(target: TargetProfile, *, external: bool = False) -> TrackingSettings:
-    """Choose the tracker's settings for a target profile and a detector.
+def tracking_settings(target: TargetProfile) -> TrackingSettings:
+    """Choose the tracker's settings for a target profile.
 
     A colour is located to a fraction of a pixel. What moves need not be the target, so tracks by motion must travel
     before they are confirmed; a person who walks straight towards the camera is confirmed after moving sideways.
-    Detections of an external detector are confirmed by their number alone.
-
-    Args:
-        target: target profile.
-        external: whether the detections come from an external detector, and not from the one that the profile names.
+    Detections of a user's own detector are confirmed by their number alone.
     """
-    by_detector = {} if external else BY_DETECTOR.get(target.detector, {})
+    by_detector = BY_DETECTOR.get(target.detector, {})
     return TrackingSettings(**{**BY_MOTION[target.motion], **by_detector})  # type: ignore[arg-type]
 
 

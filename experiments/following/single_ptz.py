@@ -14,7 +14,7 @@ fixed camera's, which is 1 for the pair.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
 
@@ -25,16 +25,20 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, SimConfig, TargetProfile
 from cotarget.detection import Detections
-from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, closeup_of, counted, true_calibration
+from cotarget.estimation.measurement_model import Pose
+from cotarget.estimation.motion_model import GATE
+from cotarget.estimation.zoom_matching import CloseupFinder, ZoomMeasurement
+from cotarget.evaluation import TruthDetector, TruthNoise, closeup_of, counted, true_calibration
+from cotarget.geometry import Array
 from cotarget.metrics import BACKGROUND_S, ROUNDING_S, WHOLLY_VISIBLE, score
 from cotarget.metrics import Row as Judged
 from cotarget.pantilt import towards
 from cotarget.pipeline import FollowSettings, follow
-from cotarget.rig import Frame, Rig
+from cotarget.rig import Detection, Frame, Image, Rig
 from cotarget.safety.safe_rig import guard
 from cotarget.schema import Positive
 from cotarget.sim.targets.random_paths import LONE, SECONDS
-from cotarget.sim.truth import Outlines, Truth
+from cotarget.sim.truth import Appearances, Outlines, Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Row, Settings
 from experiments.following.field_scenes import hold_config
@@ -50,6 +54,7 @@ FAR = 1000.0  # distance at which the offset of the cameras is negligible [m]
 STREAM = 25  # random stream
 NOISE = TruthNoise()
 APART = 1 << 32  # offset of the seed from the detectors' own
+FINDER_SEED = 1 << 33  # offset of the seed of what finds the target in the zoom image
 MOVED_PX, MOVED_S = 1.0, 0.02  # least shift of a moving image, within this time before and after its exposure
 
 
@@ -90,7 +95,7 @@ def figures(judged: Sequence[Judged], way: str) -> Row:
     return {
         "closeup_yield": found.closeup_yield,
         "in_frame_ratio": found.in_frame_ratio if found.in_frame_ratio is not None else 0.0,
-        "in_frame_of_all": float(np.mean([row.in_frame for row in since])) if since else None,
+        "in_frame_of_all": float(np.mean([row.closeup.in_frame for row in since])) if since else None,
         "time_to_acquire_s": found.time_to_acquire_s,
         "tpo_width_median": found.tpo_width_median,
         "watched": _watched(since, way),
@@ -105,6 +110,49 @@ def _watched(since: Sequence[Judged], way: str) -> float | None:
 
 
 # Runs
+
+
+class TruthFinder:
+    """Find a target in the zoom image by ground truth with noise, for `FollowSettings.finder`.
+
+    Like the real finder it gives the body's centre, if that is where it is expected. Occlusion is not considered.
+    """
+
+    SIGMA_PX = 1.0  # of the noise; the real finder assumes as much for lens, head and frame times
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        target: TargetProfile,
+        truth: Appearances,
+        name: str,
+        seed: int,
+        missed: Callable[[float], bool] = lambda t: False,
+    ) -> None:
+        """Create a finder of the target ``name``, which fails in frames whose exposure times [s] are ``missed``."""
+        self._map = CloseupFinder(calibration, target).affine_map
+        self._truth, self._name, self._missed = truth, name, missed
+        self._numbers_at = counted(seed + FINDER_SEED)
+
+    def store(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
+        """Do nothing: the ground truth is always known."""
+
+    def fixed_view_at(self, t: float) -> bool:
+        """Return True: the ground truth is known at any time."""
+        return True
+
+    def find(self, frame: Frame, x_fixed: Array, covariance: Array, pose: Pose) -> ZoomMeasurement | None:
+        """Find the target; None if its centre is outside the frame or outside the gate."""
+        A, box = self._map(x_fixed, pose), self._truth.box(self._name, "zoom", frame.t)
+        if A is None or box is None or self._missed(frame.t):
+            return None
+        noise = self.SIGMA_PX * self._numbers_at(frame.t).normal(size=2)
+        at = self._truth.center_px(self._name, "zoom", frame.t) + noise
+        off = at - A[:, 2]
+        inside = (at >= 0).all() and (at <= np.array(frame.image.shape[1::-1]) - 1).all()
+        if not inside or off @ np.linalg.solve(covariance, off) > GATE:
+            return None
+        return ZoomMeasurement(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), frame.t)
 
 
 class Shaken:

@@ -8,7 +8,6 @@ view without the book counts half the diagonal), size over the wanted size, and 
 """
 
 import dataclasses
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -106,10 +105,11 @@ def first_and_last(steps: Iterator[Step]) -> tuple[Step, Step]:
 
 
 def _told(judged: Judged) -> dict[str, Any]:
+    seen = judged.closeup
     return {
-        "tpo_px": judged.tpo_px,
-        "tpo_percent": 100 * judged.tpo_px / judged.width_px,
-        "size_ratio": judged.size_ratio if math.isfinite(judged.size_ratio) else None,
+        "tpo_px": seen.tpo_px,
+        "tpo_percent": 100 * seen.tpo_px / seen.width_px,
+        "size_ratio": seen.size_ratio,
         "focal_px": judged.focal_px,
         "decoded": judged.decoded,
     }

@@ -147,24 +147,6 @@ def test_aim_at_a_depth_where_no_target_is_seen_has_to_be_insisted_on(folder, ca
     assert (status, bool(out), said) == ((0, True, False) if plausible else (1, False, True))
 
 
-def test_aim_warns_of_a_size_that_the_lens_cannot_show(folder, capsys):
-    """The size is along the known dimension, in whole pixels or two digits; one as wanted is not mentioned."""
-
-    def aimed(depth, target):
-        found, warnings = aim_json(capsys, "--depth", depth, "--target", target, "--wanted-px", "160", "--insist")
-        return found, [line for line in warnings if f"the lens shows the {target}" in line]
-
-    near, [line] = aimed("1", "person")
-    assert f" {1.75 * near['focal_px'] * 693 / 692 / near['range_m']:.0f} px " in line
-    far, [line] = aimed("3000", "book")
-    assert f" {0.234 * far['focal_px'] / far['range_m']:.2g} px " in line
-    limit = 72.0 * 692 / 6.0 * 0.234 / 160  # range from which on the lens is too short [m]
-    depth = 2 * limit - aimed(f"{limit}", "book")[0]["range_m"]
-    for beyond, limited, warned in ((0.998, False, False), (1.002, True, False), (1.008, True, True)):
-        book, lines = aimed(f"{depth * beyond}", "book")
-        assert (book["focal_limited"], bool(lines)) == (limited, warned)
-
-
 @pytest.mark.parametrize("focal_mm", ["6", "50", "72"])
 def test_aim_takes_a_focal_length(folder, capsys, focal_mm):
     found, warnings = aim_json(capsys, "--depth", "9", "--focal-mm", focal_mm)

@@ -11,7 +11,7 @@ from cotarget.config import parse_config
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome
 from cotarget.detection import Detections
-from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, true_calibration
+from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings
 from cotarget.rig import Frame
@@ -20,6 +20,7 @@ from cotarget.targeting import Reach
 from experiments.following import delay, field, first_shot, five_targets
 from experiments.following.field_scenes import hold_config
 from experiments.following.first_shot import CAUSES, Shot, budget
+from experiments.following.single_ptz import TruthFinder
 from experiments.following.wide_view import Seen, WideView, open_on, record
 from tests.support.rigs import with_zoom_head
 
@@ -161,7 +162,7 @@ def test_good_seconds_agree_with_the_rows(exact):
     found = five_targets.good_seconds(exact, config, target, 4.0, how, view, FirstCome())
     rows = field.held(exact, config, "person", 4.0, how, view)
     assert found.keys() == {"person"}
-    assert found["person"] == pytest.approx(FRAME_S * sum(row.good_closeup for row in rows[1:]))
+    assert found["person"] == pytest.approx(FRAME_S * sum(row.closeup.good for row in rows[1:]))
     assert found["person"] > 0
 
 

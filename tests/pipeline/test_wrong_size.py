@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, true_calibration
+from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.sim.world import SimWorld
 from experiments.following.field_scenes import hold_config
+from experiments.following.single_ptz import TruthFinder
 
 # As well as the real detectors find them.
 NOISE = {"book": TruthNoise(0.2, 0.01, 0.0), "person": TruthNoise(0.5, 0.04, 0.05), "bird": TruthNoise(0.5, 0.06, 0.05)}
