@@ -31,8 +31,7 @@ from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, watched, watched_in
-from experiments.following.field_scenes import hold_config
+from experiments.following.field import FieldSettings, calibrated, hold_config, watched, watched_in
 from experiments.tables import outside
 
 IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")

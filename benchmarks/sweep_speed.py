@@ -18,7 +18,7 @@ from cotarget.schema import Positive
 from cotarget.sim.world import SimWorld
 from experiments.calibration import chain
 from experiments.engine import Case, Count, Experiment, Job, Row, Settings, csv_of, on_dask
-from experiments.following.field_scenes import hold_config
+from experiments.following.field import hold_config
 from experiments.tables import grouped, spread_columns
 
 PROCESSES = (1, 2)

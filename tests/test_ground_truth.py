@@ -10,7 +10,7 @@ from cotarget.evaluation import TruthDetector, TruthNoise, counted
 from cotarget.rig import Frame
 from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.world import SimWorld
-from experiments.following.field_scenes import five_targets_config, hold_config
+from experiments.following.field import five_targets_config, hold_config
 
 STEP = 0.04
 TIMES = np.arange(0.0, SECONDS + STEP / 2, STEP)

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from cotarget.board import board_points
 from cotarget.calibration import Calibration, Covariance, Options, calibrate_views, predicted_pointing
@@ -96,17 +95,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
         case: {f"{name}_px": rms(row[f"{name}_px"] for row in mine) for name in FIGURES}
         for case, mine in grouped(rows, "case").items()
     }
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Measured beside predicted error of each seed."""
-    ax = figure.subplots()
-    for case, mine in grouped(rows, "case").items():
-        ax.plot([row["predicted_px"] for row in mine], [row["joint_px"] for row in mine], ".", label=case)
-    top = max(row["joint_px"] for row in rows)
-    ax.plot([0, top], [0, top], "k", lw=0.8)
-    ax.set(xlabel="predicted [px at f = 7155 px]", ylabel="measured")
-    ax.legend(frameon=False)
 
 
 SETTINGS = ChainSettings()

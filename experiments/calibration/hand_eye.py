@@ -12,7 +12,6 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge
-from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from cotarget.calibration.bundle import fit
@@ -123,17 +122,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
         }
     found["Cramer-Rao"] = {"rotation_deg": bound_deg, "translation_mm": bound_mm}
     return found
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Cumulative errors of the methods."""
-    for ax, key, unit in zip(figure.subplots(1, 2), ("rotation_deg", "translation_mm"), ("deg", "mm"), strict=True):
-        for method in METHODS:
-            errors = np.sort([row[key] for row in rows if row["method"] == method])
-            ax.semilogx(errors, np.linspace(0, 1, len(errors)), label=method)
-        ax.axvline(rms(row[f"bound_{unit}"] for row in rows), color="k", lw=0.8, label="Cramer-Rao, rms")
-        ax.set(xlabel=f"{key.split('_')[0]} [{unit}]", ylabel="share of seeds")
-    ax.legend(frameon=False)
 
 
 SETTINGS = HandEyeSettings()

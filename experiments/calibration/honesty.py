@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from cotarget.board import board_points
@@ -122,16 +121,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
         }
         for rig, mine in grouped(rows, "rig").items()
     }
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Measured over predicted pointing error of each seed."""
-    ax = figure.subplots()
-    for rig, mine in grouped(rows, "rig").items():
-        ratios = [row["measured_px"] / row["predicted_px"] for row in mine]
-        ax.hist(ratios, bins=np.linspace(0, 3, 31).tolist(), histtype="step", label=rig)
-    ax.set(xlabel="measured / predicted pointing error", ylabel="seeds")
-    ax.legend(frameon=False)
 
 
 SETTINGS = HonestySettings()

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from cotarget.board import board_points
 from cotarget.calibration import View, calibrate_views, predicted_pointing
@@ -189,18 +188,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
             "why_refused": sorted({row["refused"] for row in mine if row["refused"]}),
         }
     return found
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """The ratio of measured to predicted error, case by case."""
-    ax = figure.subplots()
-    cases = list(dict.fromkeys(row["case"] for row in rows))
-    told = [row for row in rows if not row["refused"]]
-    ax.semilogx([row["ratio"] for row in told], [cases.index(row["case"]) for row in told], ".")
-    ax.axvline(WITHIN, color="k", lw=0.8)
-    ax.set_yticks(range(len(cases)), cases)
-    ax.invert_yaxis()
-    ax.set_xlabel("measured / predicted pointing error")
 
 
 SETTINGS = MismatchSettings()

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.calibrate import calibrate
@@ -27,7 +26,7 @@ from cotarget.sim.world import SimWorld
 from cotarget.targeting import Method
 from experiments.engine import Count, Row
 from experiments.following.own_rig import OwnRig, RigText, calibrated_rig
-from experiments.tables import grouped, outside, points, spreads
+from experiments.tables import grouped, outside, spreads
 
 RIGS = {
     "default": SimConfig(scene="indoor"),
@@ -109,18 +108,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, dict[str, fl
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List the figures of the full model that exceed their goal."""
     return [text for rig, models in summary.items() for text in outside(models[FULL], WANTED, rig)]
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Median errors by model: the median over the seeds, least to largest, each seed a point."""
-    rigs = grouped(rows, "rig")
-    for ax, (rig, found) in zip(
-        figure.subplots(1, len(rigs), sharey=True, squeeze=False)[0], rigs.items(), strict=True
-    ):
-        for i, (model, mine) in enumerate(grouped(found, "model").items()):
-            points(ax, i, [row["median_deg"] for row in mine], color=f"C{i}", label=model)
-        ax.set(title=rig, yscale="log", ylabel="median pointing error [degrees]", xticks=[])
-    ax.legend(frameon=False)
 
 
 SETTINGS = Settings()

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from cotarget.board import board_points
 from cotarget.calibration import Calibration, calibrate_views, predicted_pointing
@@ -210,15 +209,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "why_refused": {row["seed"]: row["refused"] for row in rows if row["refused"]},
         "beyond": {row["seed"]: row["ratio"] for row in found if row["ratio"] > WITHIN},
     }
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """The ratio of measured to predicted error over the baseline."""
-    found = [row for row in rows if not row["refused"]]
-    ax = figure.subplots()
-    ax.loglog([row["baseline_m"] for row in found], [row["ratio"] for row in found], ".")
-    ax.axhline(WITHIN, color="k", lw=0.8)
-    ax.set(xlabel="baseline [m]", ylabel="measured / predicted pointing error")
 
 
 SETTINGS = RigsSettings()

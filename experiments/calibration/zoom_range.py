@@ -9,14 +9,11 @@ true calibration rounded in the same way.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 
 from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.calibration.calibrate import calibrate
@@ -160,25 +157,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 def median(values: Any) -> float:
     """Give the median of an iterable."""
     return float(np.median(list(values)))
-
-
-def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Rms pointing error over the focal length and what each calibration predicts: medians, half the seeds shaded."""
-    heads = grouped(rows, "head")
-    for ax, (head, mine) in zip(
-        figure.subplots(1, len(heads), sharey=True, squeeze=False)[0], heads.items(), strict=True
-    ):
-        focal = sorted({row["nominal_px"] for row in mine})
-        for key, words in (("rms_deg", "measured"), ("predicted_deg", "predicted")):
-            values = [[row[key] for row in mine if row["nominal_px"] == f] for f in focal]
-            low, middle, high = (np.array([np.percentile(each, q) for each in values]) for q in (25, 50, 75))
-            (line,) = ax.loglog(focal, middle, label=words)
-            ax.fill_between(focal, low, high, color=line.get_color(), alpha=0.25, lw=0)
-        ax.set(title=f"head: {head}", xlabel="nominal focal length [px]", ylabel="rms pointing error [degrees]")
-        octaves = focal[0] * 2.0 ** np.arange(1 + math.floor(math.log2(focal[-1] / focal[0])))
-        ax.set_xticks(octaves, [f"{each:.0f}" for each in octaves])
-        ax.xaxis.set_minor_locator(NullLocator())
-        ax.legend(frameon=False)
 
 
 SETTINGS = ZoomRangeSettings()

@@ -6,7 +6,7 @@ tracker's usual settings.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -20,9 +20,6 @@ from experiments.engine import Row
 from experiments.following import films
 from experiments.following.films import FolderSettings, LabelledFilm, detector_tracks, jobs, labelled_film, needs
 from experiments.tables import grouped
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["jobs", "needs"]
 B = TypeVar("B", bound=Box)
@@ -161,16 +158,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     """List the figures that are not as wanted."""
     recall = summary["half and a third"]["recall up to 12 px"]
     return [] if recall >= WANTED else [f"half and a third: recall up to 12 px: {recall:.3f}, not {WANTED:g} or more"]
-
-
-def plot(rows: Sequence[Row], figure: "Figure") -> None:
-    """Recall and false tracks a minute of each alteration."""
-    left, right = figure.subplots(1, 2, sharey=True)
-    for axes, name in ((left, "recall"), (right, "false tracks a minute")):
-        figures = {way: _figures(mine)[name] for way, mine in grouped(rows, "way").items()}
-        axes.barh([*figures], [*figures.values()])
-        axes.set(xlabel=name)
-    left.invert_yaxis()
 
 
 SETTINGS = AlteredFilmsSettings()

@@ -1,6 +1,6 @@
 """Value of the head's deadband: commands and reversals a minute with and without it, and the offset that it costs.
 
-A book that is moved once and a person who walks are followed in the field of `experiments.following.field_scenes` by
+A book that is moved once and a person who walks are followed in the field of `experiments.following.field` by
 the whole pipeline. Only the deadband differs between the runs.
 """
 
@@ -14,8 +14,7 @@ from cotarget.control.head import HeadSettings
 from cotarget.metrics import score
 from cotarget.pipeline import FollowSettings
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, held
-from experiments.following.field_scenes import hold_config
+from experiments.following.field import FieldSettings, calibrated, held, hold_config
 from experiments.following.wide_view import record
 from experiments.tables import grouped, outside, spread
 

@@ -1,6 +1,6 @@
 """Value of prediction: the close-up's offset with and without it, over the delay of cameras and head.
 
-A person walks and a bird flies in the field of `experiments.following.field_scenes`. The delay from light to the start
+A person walks and a bird flies in the field of `experiments.following.field`. The delay from light to the start
 of motion goes from 0 to 600 ms; three fifths are the cameras' and the rest that of head and lens, as in the field's 120
 + 80 ms. Without prediction the head is sent to where the target was detected. The curve uses the fixed view alone,
 rendered once per seed. At the field's delay both can also be compared with correction from the zoom view (`--set
@@ -21,8 +21,7 @@ from cotarget.metrics import score
 from cotarget.pipeline import FollowSettings
 from cotarget.schema import NotNegative
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, held
-from experiments.following.field_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
+from experiments.following.field import COMMAND_DELAY_S, LATENCY_S, FieldSettings, calibrated, held, hold_config
 from experiments.following.wide_view import record
 from experiments.tables import grouped, spread
 

@@ -1,6 +1,6 @@
 """Detectors compared in the field: targets found and false tracks, with a static and with a shaking camera.
 
-Scenes have five persons, five birds or no target in the field of `experiments.following.field_scenes`, where foliage,
+Scenes have five persons, five birds or no target in the field of `experiments.following.field`, where foliage,
 clouds and shadows move about as strongly as the targets. Each frame is rendered once, searched by every detector and
 tracked. Ground truth judges the tracks: the fraction of time that a wholly visible target has a confirmed track, false
 tracks a minute, and switches of a track to another target. The shaking camera's frames are those of the static one,
@@ -31,7 +31,7 @@ from cotarget.sim.world import SimWorld
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 from experiments.engine import Count, Row, Settings
-from experiments.following.field_scenes import field_config, five_targets_config
+from experiments.following.field import field_config, five_targets_config
 from experiments.following.wide_view import WIDE
 from experiments.tables import grouped, spread
 

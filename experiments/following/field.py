@@ -1,18 +1,22 @@
-"""Shared by all experiments in the field: its calibration, the targets' settings, and runs judged by ground truth.
+"""The field: simulated scenes, their calibration, and runs judged by ground truth; shared by the experiments in it.
 
-The field itself is described in `experiments.following.field_scenes`.
+A book that is moved, a walking person, a flying bird, or five of a kind. The rig is the default one under harder
+conditions: exposure of 1/100 s, 120 ms from light to frame, 80 ms from command to motion, outdoors, with clutter. Paths
+are random by seed (`cotarget.sim.targets.random_paths`).
+
+Runs that need no pictures open `SimWorld(config, rendered=())` and detect with `cotarget.evaluation.TruthDetector`.
 """
 
 import functools
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated
 
 from annotated_types import Gt, Le
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, TargetProfile
+from cotarget.config import RigConfig, SimConfig, TargetProfile, Waypoint
 from cotarget.control.selection import TargetSelector
 from cotarget.detection import Detector, make_detector
 from cotarget.evaluation import add_row, true_calibration
@@ -20,13 +24,53 @@ from cotarget.metrics import BACKGROUND_S
 from cotarget.metrics import Row as Judged
 from cotarget.pipeline import FollowSettings, Step, follow
 from cotarget.safety.safe_rig import guard
-from cotarget.sim.targets.random_paths import SECONDS
+from cotarget.sim.targets.random_paths import SECONDS, group_paths, lone_path
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import Settings
 from experiments.following.own_rig import OwnRig, RigText, calibrated_rig
 from experiments.following.wide_view import WideView, open_on
 from experiments.paper.paper_loop import Follow
+
+EXPOSURE_S = 0.01
+LATENCY_S = 0.12  # from light to frame, both cameras
+COMMAND_DELAY_S = 0.08  # from command to motion, head and lens
+SCENE = "outdoor"
+
+
+def hold_config(name: str, seed: int, scene: str = SCENE) -> RigConfig:
+    """Configure one target, a book, person or bird, to follow for 20 s.
+
+    Raises:
+        ConfigError: an unknown target.
+    """
+    return field_config(lone_path(name, seed), seed, scene)
+
+
+def five_targets_config(seed: int, kind: str = "person", scene: str = SCENE) -> RigConfig:
+    """Configure five persons or birds that cross the fixed view (`cotarget.sim.targets.random_paths.group_paths`).
+
+    Raises:
+        ConfigError: an unknown kind.
+    """
+    return field_config(group_paths(kind, seed), seed, scene)
+
+
+def field_config(paths: Mapping[str, tuple[Waypoint, ...]], seed: int, scene: str = SCENE) -> RigConfig:
+    """Configure the default rig under the field's conditions, with targets on paths; outdoor scenes have clutter."""
+    sim = SimConfig()
+    sim = replace(
+        sim,
+        scene=scene,
+        seed=seed,
+        targets=tuple(paths),
+        paths=paths,
+        fixed=replace(sim.fixed, latency_s=LATENCY_S, exposure_s=EXPOSURE_S),
+        zoom=replace(sim.zoom, latency_s=LATENCY_S, exposure_s=EXPOSURE_S),
+        head=replace(sim.head, command_delay_s=COMMAND_DELAY_S),
+        effects=replace(sim.effects, clutter=True),
+    )
+    return RigConfig(sim=sim)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Single shots from the fixed view alone: how well they hit, what one correction adds, and the error budget.
 
-A book, a person and a bird in the field of `experiments.following.field_scenes` are shot at repeatedly. A shot is one
+A book, a person and a bird in the field of `experiments.following.field` are shot at repeatedly. A shot is one
 command to head and lens, computed from the fixed camera alone: direction from the detections, depth from the size,
 motion over the delay from the track. Head and lens reach it as soon as the delay is over; their travel time is left
 out, as in the definition of the delay. Ground truth judges the zoom frame exposed then. The target is searched in that
@@ -40,8 +40,7 @@ from cotarget.targets import Target
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated
-from experiments.following.field_scenes import LATENCY_S, hold_config
+from experiments.following.field import LATENCY_S, FieldSettings, calibrated, hold_config
 from experiments.tables import grouped, outside, rms, spread
 
 # Goals for each target: least and largest value.

@@ -1,6 +1,6 @@
 """Target selection: how many of five targets get a good close-up under each policy.
 
-Five persons or five birds cross the fixed view in the field of `experiments.following.field_scenes`, for a while all at
+Five persons or five birds cross the fixed view in the field of `experiments.following.field`, for a while all at
 once. A target is served when it was well in the close-up, as defined by the metrics, for a second in total. The fixed
 view is rendered and searched once for each seed and kind, and followed under each policy, by default without correction
 from the zoom view (`--set five_targets.closed_loop=true`).
@@ -24,8 +24,7 @@ from cotarget.pipeline import FollowSettings
 from cotarget.sim.targets.random_paths import GROUP
 from cotarget.sim.truth import Truth
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, watched
-from experiments.following.field_scenes import five_targets_config
+from experiments.following.field import FieldSettings, calibrated, five_targets_config, watched
 from experiments.following.wide_view import WideView, record
 from experiments.tables import BESIDE, grouped
 

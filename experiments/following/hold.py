@@ -1,7 +1,7 @@
 """Following in the field: how long and how well a book, a person and a bird are kept in the close-up.
 
 The rig is the default one, calibrated from rendered boards, under the field's conditions
-(`experiments.following.field_scenes`): exposure blur, clutter, 120 ms from light to frame, 80 ms from command to
+(`experiments.following.field`): exposure blur, clutter, 120 ms from light to frame, 80 ms from command to
 motion, and true sizes that differ from the nominal ones. Each seed has another path, size and noise. Figures are
 medians over the seeds with the least and the largest, as defined in `cotarget.metrics`. Ground truth judges every
 frame; the pipeline has no access to it.
@@ -17,8 +17,7 @@ from matplotlib.figure import Figure
 
 from cotarget.metrics import score
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, held
-from experiments.following.field_scenes import hold_config
+from experiments.following.field import FieldSettings, calibrated, held, hold_config
 from experiments.tables import grouped, outside, points, spread
 
 # Goals for each figure's median: least and largest value.

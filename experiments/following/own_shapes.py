@@ -1,6 +1,6 @@
 """Targets of any shape, with no setting but their size: a car, a dog and a boat, simulated and drawn into real films.
 
-The simulated ones are MJCF models on the path of a walking person in the field of `experiments.following.field_scenes`.
+The simulated ones are MJCF models on the path of a walking person in the field of `experiments.following.field`.
 The composites are drawings of several colours that cross real films. Both are searched by the default detector of a
 target of one's own. Boxes are exact; tracks and boxes are matched one to one, from frame 30 on, see
 `cotarget.track_metrics`.
@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,14 +24,11 @@ from cotarget.track_metrics import Box, Label, score_tracks
 from cotarget.tracking.track import tracking_settings
 from experiments.engine import Count, Row
 from experiments.following import films
-from experiments.following.field_scenes import field_config
+from experiments.following.field import field_config
 from experiments.following.films import FolderSettings, LabelledFilm, labelled_film, needs, tracks_of
 from experiments.following.sim_to_real import Clip, draw_polygons, rendered
 from experiments.following.wide_view import WIDE
 from experiments.tables import grouped
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["needs"]
 WANTED = 0.95
@@ -227,20 +224,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
         for name, figures in summary.items()
         if not figures["recall"] >= WANTED
     ]
-
-
-def plot(rows: Sequence[Row], figure: "Figure") -> None:
-    """Recall of each scene over the target's larger side."""
-    axes = figure.subplots()
-    for (source, shape), mine in sorted(grouped(rows, "source", "shape").items()):
-        axes.plot(
-            [row["side_px"] for row in mine],
-            [row["found"] / row["boxes"] for row in mine],
-            "o" if source == "simulated" else "x",
-            label=f"{source}: {shape}",
-        )
-    axes.set(xscale="log", xlabel="larger side [px]", ylabel="recall", ylim=(0, 1.02))
-    axes.legend()
 
 
 SETTINGS = OwnShapesSettings()

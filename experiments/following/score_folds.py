@@ -12,7 +12,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -29,9 +29,6 @@ from experiments.engine import Count, Row
 from experiments.following import films
 from experiments.following.films import FolderSettings, LabelledFilm, labelled_film, needs, tracks_of
 from experiments.tables import grouped
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["needs"]
 PLACES = Path(__file__).with_name("film_places.csv")
@@ -155,15 +152,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     """State the recall on films that were not fitted, if it is farther off than wanted."""
     fitted, others = (summary[way]["recall"] for way in (ALL, OTHERS))
     return [] if abs(fitted - others) <= WITHIN else [f"recall {others:.3f} {OTHERS}, {fitted:.3f} {ALL}"]
-
-
-def plot(rows: Sequence[Row], figure: "Figure") -> None:
-    """Recall of each film with weights fitted to the other films over that with weights fitted to all."""
-    axes, found = figure.subplots(), grouped(rows, "way")
-    recalls = [[row["found"] / max(1, row["boxes"]) for row in found[way]] for way in (ALL, OTHERS)]
-    axes.plot(*recalls, "o")
-    axes.plot([0, 1], [0, 1], "k:")
-    axes.set(xlabel=f"recall, {ALL}", ylabel=f"recall, {OTHERS}")
 
 
 SETTINGS = ScoreFoldsSettings()

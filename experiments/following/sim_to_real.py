@@ -7,7 +7,7 @@ boxes:
 - fitted: the same, with a tight box around what contrasts in each label, because published boxes are up to seven times
   as large as the target; a label in which nothing contrasts is dropped;
 - composite: the same films with made flyers drawn far from the labels, whose boxes are exact;
-- simulation: five simulated birds in the field of `experiments.following.field_scenes`, with true boxes;
+- simulation: five simulated birds in the field of `experiments.following.field`, with true boxes;
 - simulation, fitted: the same with boxes that are fitted as those of the films, for a true box has wing tips too faint
   to be seen.
 
@@ -19,7 +19,7 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,13 +35,10 @@ from cotarget.video import Film
 from experiments.engine import Count, Row
 from experiments.following import films
 from experiments.following.detectors import COME_S
-from experiments.following.field_scenes import five_targets_config
+from experiments.following.field import five_targets_config
 from experiments.following.films import FolderSettings, needs
 from experiments.following.wide_view import WIDE
 from experiments.tables import grouped
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["needs"]
 Labels = dict[int, list[Label]]  # by frame number
@@ -439,19 +436,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
                 if abs(simulated - real) > within:
                     far.append(f"{name}: {figure} {simulated:.3g} simulated, {real:.3g} in film, not within {within:g}")
     return far
-
-
-def plot(rows: Sequence[Row], figure: "Figure") -> None:
-    """Recall in the simulation and in composites over that in films with fitted boxes, each stratum a point."""
-    summary = summarise(rows)
-    for axes, way in zip(figure.subplots(1, len(WAYS), sharey=True, squeeze=False)[0], WAYS, strict=True):
-        for kind in ("simulation", "composite"):
-            both = [each for each in summary.values() if kind in each and "fitted" in each]
-            recalls = [[each[of][f"recall {way}"] for each in both] for of in ("fitted", kind)]
-            axes.scatter(*recalls, [max(3.0, min(each[kind]["frames"], 300) / 5) for each in both], label=kind)
-        axes.plot([0, 1], [0, 1], "k:")
-        axes.set(title=way, xlabel="recall in film, fitted boxes", ylabel="recall")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
 
 SETTINGS = SimToRealSettings()

@@ -1,6 +1,6 @@
 """Single pan-tilt-zoom camera that finds and follows its target by itself, against the pair.
 
-The scene is the field of `experiments.following.field_scenes` without clutter: the same head, lens, delays, paths and
+The scene is the field of `experiments.following.field` without clutter: the same head, lens, delays, paths and
 sizes, and a rig known exactly. Nothing is rendered. Detections are ground truth with a detector's noise
 (`cotarget.evaluation`): in the fixed camera for the pair, in its own view for the single camera
 (`experiments.following.lone_camera`). Both use the same tracker with the settings of a detector by appearance, because
@@ -41,7 +41,7 @@ from cotarget.sim.targets.random_paths import LONE, SECONDS
 from cotarget.sim.truth import Appearances, Outlines, Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Row, Settings
-from experiments.following.field_scenes import hold_config
+from experiments.following.field import hold_config
 from experiments.following.lone_camera import LoneCamera, scan_of
 from experiments.tables import bars, grouped, mean_of
 

@@ -26,8 +26,7 @@ from cotarget.sim.targets.random_paths import BOOK_MOVED_AT, BOOK_TAKES, lone_pa
 from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Pictured, Row
 from experiments.following.field import OwnRigInField, calibrated
-from experiments.paper.panels import laid_out
-from experiments.paper.paper_loop import OURS, WAYS, picture_name
+from experiments.paper.paper_loop import OURS, WAYS, laid_out, picture_name
 from experiments.tables import grouped, outside, spread
 
 NAME = "book"

@@ -24,8 +24,7 @@ from cotarget.pipeline import FollowSettings, Step
 from experiments.engine import Count, Pictured, Row
 from experiments.following.field import OwnRigInField, calibrated, watched_in
 from experiments.following.wide_view import WideView, open_on, record
-from experiments.paper.panels import laid_out
-from experiments.paper.paper_loop import OURS, WAYS, picture_name
+from experiments.paper.paper_loop import OURS, WAYS, laid_out, picture_name
 from experiments.tables import grouped, outside, spread
 
 NAME = "person"

@@ -28,8 +28,7 @@ from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Pictured, Row
 from experiments.following.field import OwnRigInField, calibrated, watched_in
-from experiments.paper.panels import laid_out
-from experiments.paper.paper_loop import OURS, WAYS, picture_name
+from experiments.paper.paper_loop import OURS, WAYS, laid_out, picture_name
 from experiments.tables import spreads
 
 KIND = "person"

@@ -1,4 +1,4 @@
-"""The paper's method of following, for comparison: one open-loop command from the fixed view at a time.
+"""The paper's method of following, for comparison: one open-loop command from the fixed view at a time; its pictures.
 
 As in its Table 1: detect, depth from the size, pan and tilt by the shortcut, focal length for the wanted size, command
 head and lens. Nothing is predicted, filtered or corrected by the zoom view, and no policy limits the lens. The next
@@ -7,15 +7,19 @@ things open, which are this project's: the calibration, and the association of c
 (`Tracker`).
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+import cv2
+import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.control.controller import reach_of
 from cotarget.detection import Detector
+from cotarget.drawing import PAPER, captioned
 from cotarget.errors import UnreachableError
 from cotarget.pipeline import FollowSettings, FrameSource, State, Step, follow
-from cotarget.rig import Rig
+from cotarget.rig import Image, Rig
 from cotarget.targeting import Aim, Method, WantedSize, aim, depth_of, point_at
 from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
@@ -105,3 +109,23 @@ OURS = "this project"
 def picture_name(figure: str, way: str) -> str:
     """Name the picture of a figure by one of `WAYS`, without suffix; this project's has the figure's name."""
     return figure if way == OURS else f"{figure}_{way.replace(' ', '_')}"
+
+
+# Pictures in the layout of the paper's figures: rows of panels with captions below
+
+WIDTH_PX = 480  # width of a panel, less than a camera's image: averaged noise takes less disk space
+GAP_PX = 6  # gap right of a panel
+Panel = tuple[Image, str]
+
+
+def laid_out(rows: Iterable[Sequence[Panel]]) -> bytes:
+    """Arrange rows of captioned panels, all of one aspect ratio and equally many per row, as one PNG."""
+    return cv2.imencode(".png", np.vstack([np.hstack([_panel(*each) for each in row]) for row in rows]))[1].tobytes()
+
+
+def _panel(image: Image, caption: str) -> Image:
+    if image.ndim == 2:
+        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+    size = WIDTH_PX, round(WIDTH_PX * image.shape[0] / image.shape[1])
+    panel = captioned(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8), caption)
+    return np.asarray(cv2.copyMakeBorder(panel, 0, 0, 0, GAP_PX, cv2.BORDER_CONSTANT, value=PAPER), np.uint8)

@@ -9,7 +9,7 @@ from cotarget.sim.targets.random_paths import GROUPED, group_paths, in_view
 from cotarget.sim.truth import Silhouette
 from experiments.following import detectors
 from experiments.following.detectors import MEMORY_S, SHAKES, STANDS, Watch
-from experiments.following.field_scenes import five_targets_config
+from experiments.following.field import five_targets_config
 
 FRAMES, RATE = 100, 25.0
 HALF_SIZE = 0.5  # of a bird or, across, a person, and more [m]

@@ -18,7 +18,7 @@ from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
 from experiments.following import delay, field, first_shot, five_targets
-from experiments.following.field_scenes import hold_config
+from experiments.following.field import hold_config
 from experiments.following.first_shot import CAUSES, Shot, budget
 from experiments.following.single_ptz import TruthFinder
 from experiments.following.wide_view import Seen, WideView, open_on, record

@@ -9,7 +9,7 @@ from cotarget.errors import ConfigError
 from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.targets.target import marker_of
 from cotarget.sim.world import SimWorld
-from experiments.following.field_scenes import five_targets_config, hold_config
+from experiments.following.field import five_targets_config, hold_config
 
 SEEDS = (0, 1, 2, 100, 101)
 NAMES = ("book", "person", "bird")

@@ -13,7 +13,7 @@ from cotarget.metrics import Closeup
 from cotarget.pantilt import base_head, solve
 from experiments.paper import fig4_book, fig6_outdoors, table2_table3, worked_example
 from experiments.paper.fig6_outdoors import Moment, figures
-from experiments.paper.panels import GAP_PX, WIDTH_PX, laid_out
+from experiments.paper.paper_loop import GAP_PX, WIDTH_PX, laid_out
 
 ROUNDING = 1e-9  # relative, or of millimetres of ten metres
 

@@ -9,7 +9,7 @@ import pytest
 from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.sim.world import SimWorld
-from experiments.following.field_scenes import hold_config
+from experiments.following.field import hold_config
 from experiments.following.single_ptz import TruthFinder
 
 # As well as the real detectors find them.
