@@ -1,4 +1,4 @@
-"""Statistics of figures over the seeds, as numbers, text and plots; shared by the experiments."""
+"""Statistics of figures over the seeds, as numbers and text; shared by the experiments."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -7,13 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from cotarget.geometry import Array
 
 SPREAD = ("median", "least", "largest")
 WHOLE = 1000.0  # numbers from this on are printed without decimals
-BESIDE = 0.12  # offset of the values to the right of the median
 Range = tuple[float, float]
 Row = dict[str, Any]  # a row of an experiment: numbers, texts and truth values by column
 
@@ -140,33 +137,3 @@ def columns(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
     import pandas as pd
 
     return str(pd.DataFrame([list(map(number, line)) for line in lines], columns=list(head)).to_string(index=False))
-
-
-# Plots
-
-
-def points(ax: "Axes", at: float, values: Iterable[float | None], **how: Any) -> None:
-    """Draw the values that are there: their median with a bar from least to largest, and each value beside it."""
-    told = [value for value in values if value is not None]
-    if told:
-        found = spread(told)
-        reach = [[found["median"] - found["least"]], [found["largest"] - found["median"]]]
-        bar = ax.errorbar([at], [found["median"]], yerr=reach, fmt="_", markersize=12, capsize=3, **how)
-        ax.plot([at + BESIDE] * len(told), told, ".", color=bar.lines[0].get_color(), alpha=0.5)
-
-
-def bars(ax: "Axes", at: Sequence[float], values: Sequence[Sequence[float]], width: float, **how: Any) -> None:
-    """Draw the mean of each group of values as a bar with its standard error, and each value as a point on it."""
-    means, errors = np.array([mean_of(each) for each in values]).T
-    ax.bar(at, means, width, yerr=np.nan_to_num(errors), capsize=3, **how)
-    for place, each in zip(at, values, strict=True):
-        ax.plot([place] * len(each), each, ".", ms=3, color="k")
-
-
-def quartiles(ax: "Axes", rows: Iterable[Row], x: str, y: str, **how: Any) -> list[Any]:
-    """Draw the median of a column over another one, with bars of its quartiles; give the places on the x axis."""
-    found = dict(sorted(grouped(rows, x).items()))
-    low, mid, high = np.array([np.percentile([row[y] for row in mine], [25, 50, 75]) for mine in found.values()]).T
-    style: dict[str, Any] = {"fmt": "o", "ms": 4, "capsize": 2, **how}
-    ax.errorbar(list(found), mid, [mid - low, high - mid], **style)
-    return list(found)

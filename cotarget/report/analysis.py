@@ -469,11 +469,6 @@ def empty_places(corners: Corners) -> list[str]:
     return found
 
 
-def share_beyond(residuals: Array, sigma: float, times: float = 3.0) -> float:
-    """Compute the share of coordinates beyond ``times`` standard deviations; 0.27 % of Gaussian ones are beyond 3."""
-    return float(np.mean(np.abs(residuals) > times * sigma)) if residuals.size else 0.0
-
-
 @dataclass(frozen=True, eq=False)
 class Analysis:
     """Figures of a calibration, on which its verdict, its advice and its page are based."""

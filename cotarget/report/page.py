@@ -23,7 +23,6 @@ from cotarget.report.analysis import (
     analyse,
     averaged,
     corner_errors,
-    share_beyond,
 )
 from cotarget.report.figures import Plot
 from cotarget.report.text import (
@@ -159,8 +158,7 @@ def _residuals(evidence: Evidence) -> list[str]:
         known, beyond = int(np.isfinite(cells.means[:, 0]).sum()), int(cells.beyond_chance.sum())
         lines.append(
             f"{TITLES[name].capitalize()}: {len(corners.residuals)} corners, standard deviation "
-            f"{digits(corners.sigma)} px a coordinate; {percent(share_beyond(corners.residuals, corners.sigma))} "
-            f"beyond three of them (0.3 % of Gaussian ones); {beyond} of {count(known, 'average')} larger than chance "
-            "makes it (one in 90 of noise alone)."
+            f"{digits(corners.sigma)} px a coordinate; {beyond} of {count(known, 'average')} larger than chance makes "
+            "it (one in 90 of noise alone)."
         )
     return [*lines, board_in_words(evidence.shape)]

@@ -26,7 +26,7 @@ from cotarget.sim.truth import Truth
 from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated, five_targets_config, watched
 from experiments.following.wide_view import WideView, record
-from experiments.tables import BESIDE, grouped
+from experiments.tables import grouped
 
 FIRST = "first-come"
 WANTED = 1.5  # goal: targets served by the best policy over those by first-come
@@ -120,7 +120,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
             served = [row["served"] for row in each]
             mean = float(np.mean(served))
             ax.bar(i, mean, 0.6, yerr=[[mean - min(served)], [max(served) - mean]], capsize=4, alpha=0.6)
-            ax.plot(i + np.linspace(-BESIDE, BESIDE, len(served)), served, "k.")
+            ax.plot(i + np.linspace(-0.12, 0.12, len(served)), served, "k.")
         ax.set(title=f"five {kind}s", ylabel="targets served", ylim=(0, GROUP + 0.2))
         ax.set_xticks(range(len(POLICIES)), POLICIES)
 

@@ -13,12 +13,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.metrics import score
 from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated, held, hold_config
-from experiments.tables import grouped, outside, points, spread
+from experiments.tables import grouped, outside, spread
 
 # Goals for each figure's median: least and largest value.
 WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -105,7 +106,12 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     labels = {"closeup_yield": "close-up yield", "tpo_width_median": "median offset / width"}
     for ax, (key, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
         for i, mine in enumerate(targets.values()):
-            points(ax, i, [row[key] for row in mine], color=f"C{i}")
+            told = [row[key] for row in mine if row[key] is not None]
+            if told:
+                middle = np.median(told)
+                reach = [[middle - min(told)], [max(told) - middle]]
+                ax.errorbar([i], [middle], yerr=reach, fmt="_", markersize=12, capsize=3, color=f"C{i}")
+                ax.plot([i + 0.12] * len(told), told, ".", color=f"C{i}", alpha=0.5)
         ax.set(ylabel=label, xticks=range(len(targets)), xticklabels=list(targets))
 
 

@@ -38,8 +38,7 @@ RING = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1
 SEARCH_S = 3.0  # longest search around the prediction [s]
 SIZES_S = 0.5  # window of the size estimate, a wing beat or a step [s]
 # Duration of a manoeuvre as white acceleration [s], by the target's motion model. The choice is in docs/design-notes.md
-# (Experiments). It is the setting lasts_s of `experiments.following.single_ptz`. A book that is carried accelerates
-# more than its motion model says.
+# (Experiments). A book that is carried accelerates more than its motion model says.
 LASTS_S = {"standing": 2.0, "walking": 0.25, "flying": 0.1}
 CLIPPED = 9.0  # factor on the variance of a centre that the image's border cuts
 
@@ -58,14 +57,9 @@ class Sighting:
 class Course:
     """Target's pan and tilt, each filtered with constant velocity."""
 
-    def __init__(self, target: TargetProfile, noise_px: float, lasts_s: float | None = None) -> None:
-        """Start without a sighting.
-
-        Detections' centres have this noise. A manoeuvre lasts ``lasts_s`` as white acceleration, by default as long as
-        the target's motion model says.
-        """
+    def __init__(self, target: TargetProfile, noise_px: float) -> None:
+        """Start without a sighting; detections' centres have this noise."""
         self._target, self._noise_px = target, noise_px
-        self._lasts_s = LASTS_S[target.motion] if lasts_s is None else lasts_s
         self._settings = filter_settings(target)
         self._axes: list[AxisFilter] = []
         self._sizes: list[Sighting] = []
@@ -131,7 +125,7 @@ class Course:
 
     def _noise(self, distance: float) -> float:
         """Give the white acceleration of an angle [rad^2/s^3] that stands for manoeuvres at constant velocity."""
-        return self._lasts_s * (self._settings.motion.acceleration / distance) ** 2
+        return LASTS_S[self._target.motion] * (self._settings.motion.acceleration / distance) ** 2
 
 
 class LoneCamera:
@@ -151,12 +145,11 @@ class LoneCamera:
         delay_s: float,
         noise_px: float,
         field: Sequence[Angles],
-        lasts_s: float | None = None,
     ) -> None:
         """Start a scan of the field's poses (see `scan_of`) at the one that is nearest to the current pose.
 
         The rig's fixed camera is not used; ground truth gives head and lens at a frame's time. A command takes
-        ``delay_s`` until motion. For ``noise_px`` and ``lasts_s`` see `Course`.
+        ``delay_s`` until motion. For ``noise_px`` see `Course`.
         """
         self._rig, self._truth, self._calibration, self._target = rig, truth, calibration, target
         self._detector, self._delay_s, self._field = detector, delay_s, list(field)
@@ -164,7 +157,7 @@ class LoneCamera:
         self._shortest, longest = (self._zoom.at(f).focal_px[0] for f in rig.zoom.focal_range)
         self._policy = ZoomController((self._shortest, longest), rig.zoom.size)
         self._head_controller = HeadController(rig.head.limits)
-        self._course, self._tracker = Course(target, noise_px, lasts_s), Tracker(tracking_settings(target))
+        self._course, self._tracker = Course(target, noise_px), Tracker(tracking_settings(target))
         self._focal = rig.zoom.zoom(rig.zoom.focal_range[0])
         self._next, self._round, self._set_out = 0, self._field, -math.inf
         self.mode = ""

@@ -32,7 +32,7 @@ from experiments.calibration.synthetic.views import Boards, Looks, Placing, spre
 from experiments.engine import Count, Row, Settings
 from experiments.following.mounted import MOUNTED_DEG, at, cell_name, mounted, off_px, wanted_focal_px
 from experiments.following.simpler import CENTRING, FULL, IGNORED, MODELS, TABLE, TURNED, ZEROED, models_of
-from experiments.tables import as_text, grouped, quartiles, rms
+from experiments.tables import as_text, grouped, rms
 
 BOARD = BoardConfig()
 STEP = np.radians(SimHead().step_deg)
@@ -226,8 +226,11 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 def _over_depth(ax: Axes, rows: Sequence[Row], key: str, number: int, **style: Any) -> None:
     """Plot one model's medians and quartiles over the seeds, shifted and thinner by its number."""
-    aside = [row | {"depth_m": row["depth_m"] * 1.03 ** (number - 3)} for row in rows]
-    quartiles(ax, aside, "depth_m", key, ls="-" if number % 2 == 0 else "--", lw=3 - number / 3, **style)
+    found = sorted(grouped(rows, "depth_m").items())
+    low, mid, high = np.array([np.percentile([row[key] for row in mine], [25, 50, 75]) for _, mine in found]).T
+    depths = [depth * 1.03 ** (number - 3) for depth, _ in found]
+    style |= {"ls": "-" if number % 2 == 0 else "--", "lw": 3 - number / 3}
+    ax.errorbar(depths, mid, [mid - low, high - mid], fmt="o", ms=4, capsize=2, **style)
 
 
 def _regimes(ax: Axes, rows: Sequence[Row], model: str) -> None:

@@ -36,14 +36,13 @@ from cotarget.pantilt import towards
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.rig import Detection, Frame, Image, Rig
 from cotarget.safety.safe_rig import guard
-from cotarget.schema import Positive
 from cotarget.sim.targets.random_paths import LONE, SECONDS
 from cotarget.sim.truth import Appearances, Outlines, Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Row, Settings
 from experiments.following.field import hold_config
 from experiments.following.lone_camera import LoneCamera, scan_of
-from experiments.tables import bars, grouped, mean_of
+from experiments.tables import grouped, mean_of
 
 WIDE_PX = SimConfig().fixed.focal_px[0]
 LEAST_MISS = 0.05
@@ -67,9 +66,6 @@ class SingleSettings(Settings):
     targets: tuple[str, ...] = LONE  # book, person or bird
     # Fractions of zoom frames in which the target is missed while the image moves.
     misses: tuple[Annotated[float, Interval(ge=0, le=1)], ...] = (0.05, 0.5, 0.9)
-    # Duration of the single camera's manoeuvres [s] (see `experiments.following.lone_camera`); by default that of each
-    # target.
-    lasts_s: Positive | None = None
 
 
 def one(settings: SingleSettings, seed: int) -> list[Row]:
@@ -78,7 +74,7 @@ def one(settings: SingleSettings, seed: int) -> list[Row]:
     for name in settings.targets:
         for way in WAYS:
             for miss in settings.misses:
-                judged = held(way, name, seed, settings.seconds, miss, settings.lasts_s)
+                judged = held(way, name, seed, settings.seconds, miss)
                 rows.append({"seed": seed, "target": name, "way": case(way, miss)} | figures(judged, way))
     return rows
 
@@ -192,10 +188,10 @@ def config_of(name: str, seed: int) -> RigConfig:
     return replace(config, targets={**config.targets, name: looks})
 
 
-def held(way: str, name: str, seed: int, seconds: float, miss: float, lasts_s: float | None = None) -> list[Judged]:
+def held(way: str, name: str, seed: int, seconds: float, miss: float) -> list[Judged]:
     """Run one way, PAIR or LONE_CAMERA, from a start without search; judge each zoom frame.
 
-    While the image moves, the target is missed in a fraction ``miss`` of the zoom frames. For ``lasts_s`` see `Course`.
+    While the image moves, the target is missed in a fraction ``miss`` of the zoom frames.
     """
     world = SimWorld(config_of(name, seed), rendered=())
     target, calibration = world.config.target(name), true_calibration(world)
@@ -215,7 +211,7 @@ def held(way: str, name: str, seed: int, seconds: float, miss: float, lasts_s: f
             times = by_pair(rig, calibration, target, outlines, name, seed, shaken, left)
         else:
             field = scan_of(rig, calibration)
-            lone = (rig, world.truth(), calibration, target, shaken, delay_s, NOISE.center_px, field, lasts_s)
+            lone = (rig, world.truth(), calibration, target, shaken, delay_s, NOISE.center_px, field)
             times = (frame.t for frame in LoneCamera(*lone).run(left))
         for t in times:
             if t > rows[-1].t_s:
@@ -343,7 +339,11 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
         for i, way in enumerate(ways):
             mine = [[r for r in rows if (r["target"], r["way"]) == (name, way)] for name in targets]
             x = np.arange(len(targets)) + (i - (len(ways) - 1) / 2) * 0.8 / len(ways)
-            bars(ax, x.tolist(), [_told(each, key) for each in mine], 0.75 / len(ways), label=way, **styles[i])
+            seeds = [_told(each, key) for each in mine]
+            means, errors = np.array([mean_of(each) for each in seeds]).T
+            ax.bar(x, means, 0.75 / len(ways), yerr=np.nan_to_num(errors), capsize=3, label=way, **styles[i])
+            for place, each in zip(x, seeds, strict=True):
+                ax.plot([place] * len(each), each, ".", ms=3, color="k")
         ax.set(ylabel=label, ylim=(0, None if key.endswith("_s") else 1.02))
         ax.set_xticks(range(len(targets)), targets)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
