@@ -1,8 +1,7 @@
 """From an estimate to commands, on a rig whose cameras and axes all meet in one point: every angle is an arctangent."""
 
 import math
-from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,11 +15,11 @@ from cotarget.control.zoom import ZoomSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Appearance
 from cotarget.geometry import pose
-from cotarget.rig import PanTiltState, ZoomState
+from cotarget.rig import PanTiltLimits
 from cotarget.rig_geometry import FixedCamera, ZoomHead
-from cotarget.sim.motion import Axis
 from cotarget.targeting import WantedSize
-from tests.support.rigs import alike, rig_of
+from tests.support.formula_rig import FormulaRig
+from tests.support.rigs import rig_of
 
 SIZE, CENTER = (640, 480), (319.5, 239.5)
 SHORTEST, LONGEST = 700.0, 7000.0
@@ -44,42 +43,21 @@ CALIBRATION = Calibration(
 )
 
 
-@dataclass
-class Rig:
-    """Notes what it is told; the head obeys after the delay, the lens at once."""
+class Rig(FormulaRig):
+    """A rig without steps, whose head stands somewhere; the lens is there at once."""
 
-    t: float = 0.0
-    moves: list = field(default_factory=list)
-    zooms: list = field(default_factory=list)
+    def __init__(self, t=0.0, pan=0.0, tilt=0.0):
+        super().__init__(LIMITS, t=t, delay_s=DELAY, focal_range=(SHORTEST, LONGEST))
+        self.pan.command(-10.0, pan)
+        self.tilt.command(-10.0, tilt)
 
-    def __post_init__(self):
-        self.clock = SimpleNamespace(now=lambda: self.t)
-        self.head = SimpleNamespace(limits=LIMITS, state=self._head, move=self._move)
-        self.zoom = SimpleNamespace(
-            size=SIZE, focal_range=(SHORTEST, LONGEST), state=lambda: ZoomState(self.zooms[-1], False, self.t)
-        )
-        self.zoom.zoom = self._zoom
+    @property
+    def sent(self):
+        return [tuple(move[1:]) for move in self.moves]
 
-        self.axes = [Axis(LIMITS.pan.speed, LIMITS.pan.acceleration) for _ in range(2)]
-        for pan, tilt, _ in self.moves:  # those of before
-            self._go(pan, tilt, -10.0)
-
-    def _go(self, pan, tilt, t, speed=None):
-        for axis, goal, fastest in zip(self.axes, (pan, tilt), LIMITS.capped(speed), strict=True):
-            axis.command(t, goal, fastest)
-
-    def _head(self):
-        (pan, v), (tilt, w) = (axis.motor(self.t) for axis in self.axes)
-        return PanTiltState(pan, tilt, bool(v or w), self.t)
-
-    def _move(self, pan, tilt, speed=None):
-        self.moves.append((pan, tilt, speed))
-        self._go(pan, tilt, self.t + DELAY, speed)
-        return pan, tilt
-
-    def _zoom(self, focal_px):
-        self.zooms.append(focal_px)
-        return focal_px
+    @property
+    def zoomed(self):
+        return [focal for _, focal in self.zooms]
 
 
 @dataclass
@@ -127,7 +105,7 @@ def controller(rig, **settings):
 def test_the_lens_starts_at_its_shortest_and_the_head_where_it_is():
     rig = Rig()
     assert controller(rig).commanded == (0.0, 0.0, SHORTEST)
-    assert (rig.moves, rig.zooms) == ([], [SHORTEST])
+    assert (rig.sent, rig.zoomed) == ([], [SHORTEST])
 
 
 def test_whatever_is_sent_is_counted():
@@ -140,10 +118,10 @@ def test_whatever_is_sent_is_counted():
         driver.drive(still(0.5 + 1e-4 * (i % 2)), rig.t, FRAME)
         assert driver.commanded[:2] == goal
         rig.t += FRAME
-    assert driver.head_commands == len(rig.moves) == 20
+    assert driver.head_commands == len(rig.sent) == 20
     driver.zoom_out()
     driver.zoom_out()  # it is there already
-    assert driver.lens_commands == len(rig.zooms) > 2
+    assert driver.lens_commands == len(rig.zoomed) > 2
 
 
 def test_the_aim_is_at_where_the_target_will_be_when_the_command_takes_effect():
@@ -152,14 +130,14 @@ def test_the_aim_is_at_where_the_target_will_be_when_the_command_takes_effect():
     assert found.pan == pytest.approx(math.atan(4.2 / 10))
     assert found.tilt == pytest.approx(math.atan(1 / math.hypot(4.2, 10)))  # up
     # The head was at rest in the middle: it is sent farther than there, as the target goes on.
-    assert rig.moves[-1][0] > found.pan
+    assert rig.sent[-1][0] > found.pan
 
 
 def test_without_prediction_the_aim_is_at_where_it_was_seen():
     rig = Rig(t=2.0)
     found = controller(rig, predict=False).drive(moving(1.0), 1.9, FRAME)[0]
     assert found.pan == pytest.approx(math.atan(1.9 / 10))
-    assert rig.moves == [(found.pan, found.tilt, None)]  # at full speed, for it is taken to stand there
+    assert rig.sent == [(found.pan, found.tilt, None)]  # at full speed, for it is taken to stand there
 
 
 def test_the_bias_of_the_head_is_taken_off_within_its_limits():
@@ -178,7 +156,7 @@ def test_what_cannot_be_aimed_at_moves_nothing(predict, why):
     driver = controller(rig)
     with pytest.raises(UnreachableError, match=why):
         driver.drive(predict, 0.0, FRAME)
-    assert (rig.moves, rig.zooms) == ([], [SHORTEST])
+    assert (rig.sent, rig.zoomed) == ([], [SHORTEST])
     assert driver.commanded == (0.0, 0.0, SHORTEST)
 
 
@@ -189,21 +167,21 @@ def test_a_target_that_stands_gets_one_command_of_head_and_lens():
     for i in range(50):
         rig.t = i * FRAME
         aim, reason = driver.drive(still(0.5), rig.t, FRAME)
-    assert rig.moves == [(pytest.approx(math.atan(0.05)), pytest.approx(math.atan(1 / math.hypot(0.5, 10))), None)]
+    assert rig.sent == [(pytest.approx(math.atan(0.05)), pytest.approx(math.atan(1 / math.hypot(0.5, 10))), None)]
     distance = math.sqrt(0.5**2 + 1 + 10**2)
     wanted = BOOK.wanted_px * distance / BOOK.size
     assert aim.focal_px == pytest.approx(wanted)
-    assert rig.zooms[-1] == driver.commanded[2] == pytest.approx(wanted / TRUE, rel=ZoomSettings().deadband)
+    assert rig.zoomed[-1] == driver.commanded[2] == pytest.approx(wanted / TRUE, rel=ZoomSettings().deadband)
     assert reason == "wanted"
 
 
 def test_the_less_is_known_the_wider_the_lens_stays():
     """A direction known to 0.05 rad: by the table of the normal distribution, 95 % of both axes is 2.24 sigma each."""
-    rig = Rig(moves=[(0.0, math.atan(0.1), None)])  # it looks there already
+    rig = Rig(tilt=math.atan(0.1))  # it looks there already
     _, reason = controller(rig).drive(still(0.0, sigma=0.05), 0.0, FRAME)
     assert reason == "unsure"
     # Of the height alone, the narrower axis, 95 % are within 1.96 sigma; half the book comes on top.
-    half = (SIZE[1] / 2 - ZoomSettings().rim_px) / (TRUE * rig.zooms[-1])
+    half = (SIZE[1] / 2 - ZoomSettings().rim_px) / (TRUE * rig.zoomed[-1])
     assert 1.96 < (half - 0.5 * BOOK.size / 10) / 0.05 < 2.24
 
 
@@ -211,17 +189,18 @@ def test_zooming_out_leaves_the_head_alone_and_is_told_once():
     rig = Rig()
     driver = controller(rig)
     driver.drive(still(0.5), 0.0, FRAME)
-    moves, zooms = len(rig.moves), len(rig.zooms)
+    moves, zooms = len(rig.sent), len(rig.zoomed)
     for _ in range(3):
         driver.zoom_out()
-    assert len(rig.moves) == moves
-    assert rig.zooms[zooms:] == [SHORTEST]
+    assert len(rig.sent) == moves
+    assert rig.zoomed[zooms:] == [SHORTEST]
     # Whoever moved it meanwhile: what was commanded before does not count.
-    rig._go(-0.5, 0.0, rig.t + DELAY)
+    for axis, q in ((rig.pan, -0.5), (rig.tilt, 0.0)):
+        axis.command(rig.t + DELAY, q)
     rig.t += 2.0
     driver.drive(still(0.5), rig.t, FRAME)
-    assert len(rig.moves) == moves + 1
-    assert rig.moves[-1][:2] == pytest.approx((math.atan(0.05), math.atan(1 / math.hypot(0.5, 10))))
+    assert len(rig.sent) == moves + 1
+    assert rig.sent[-1][:2] == pytest.approx((math.atan(0.05), math.atan(1 / math.hypot(0.5, 10))))
 
 
 def test_a_head_that_was_halted_on_its_way_is_sent_again():
@@ -230,25 +209,25 @@ def test_a_head_that_was_halted_on_its_way_is_sent_again():
     driver = controller(rig)
     driver.drive(still(5.0), rig.t, FRAME)
     rig.t = 0.3
-    halted = [axis.halt(rig.t) for axis in rig.axes]
+    halted = [axis.halt(rig.t) for axis in (rig.pan, rig.tilt)]
     rig.t = max(halted) + 0.5
-    assert abs(rig._head().pan - math.atan(0.5)) > 0.1
+    assert abs(rig.head.state().pan - math.atan(0.5)) > 0.1
     driver.drive(still(5.0), rig.t, FRAME)
     rig.t += 2.0
-    assert len(rig.moves) == 2
-    assert rig._head().pan == pytest.approx(math.atan(0.5))
+    assert len(rig.sent) == 2
+    assert rig.head.state().pan == pytest.approx(math.atan(0.5))
 
 
 def test_a_lost_target_is_looked_for_with_the_shortest_focal_length():
     rig = Rig()
     driver = controller(rig)
     driver.drive(still(0.5), 0.0, FRAME)
-    assert rig.zooms[-1] > SHORTEST
+    assert rig.zoomed[-1] > SHORTEST
     rig.t = 1.0
     found = driver.search(still(2.0), 0.0, FRAME)
-    assert rig.zooms[-1] == driver.commanded[2] == SHORTEST
+    assert rig.zoomed[-1] == driver.commanded[2] == SHORTEST
     assert found.pan == pytest.approx(math.atan(0.2))
-    assert rig.moves[-1][:2] == driver.commanded[:2] == pytest.approx((found.pan, found.tilt))
+    assert rig.sent[-1][:2] == driver.commanded[:2] == pytest.approx((found.pan, found.tilt))
 
 
 def test_a_lost_target_of_which_too_little_is_known_is_waited_for():
@@ -256,11 +235,11 @@ def test_a_lost_target_of_which_too_little_is_known_is_waited_for():
     for sigma, goes in ((0.30, True), (0.32, False)):
         rig = Rig()
         assert (controller(rig).search(still(2.0, sigma=sigma), 0.0, FRAME) is not None) == goes
-        assert len(rig.moves) == goes
+        assert len(rig.sent) == goes
     rig = Rig()
     with pytest.raises(UnreachableError):
         controller(rig).search(still(30.0), 0.0, FRAME)
-    assert not rig.moves
+    assert not rig.sent
 
 
 def test_the_lens_has_a_delay_of_its_own():
@@ -281,9 +260,9 @@ def test_a_narrow_target_may_be_larger():
     """Its direction is known badly along the width, of which it takes but a part."""
     focals = []
     for shape in (1.0, 2.5):
-        rig = Rig(moves=[(0.0, math.atan(0.1), None)])
+        rig = Rig(tilt=math.atan(0.1))
         controller(rig).drive(still(0.0, sigma=0.02), 0.0, FRAME, shape=shape)  # of a book its width is told
-        focals.append(rig.zooms[-1])
+        focals.append(rig.zoomed[-1])
     assert focals[1] > CLEARLY * focals[0]
 
 
@@ -294,7 +273,7 @@ def test_what_can_be_reached():
 
 
 def test_the_reach_of_a_rig_is_that_of_its_devices():
-    rig = Rig(moves=[(0.2, 0.1, None)])
+    rig = Rig(pan=0.2, tilt=0.1)
     reach = reach_of(rig)
     assert (reach.pan, reach.tilt, reach.focal_px) == (LIMITS.pan.range, LIMITS.tilt.range, (SHORTEST, LONGEST))
     assert (reach.now, reach.steps) == ((0.2, 0.1), (0.0, 0.0))
