@@ -83,34 +83,6 @@ class Bench:
         self.shutter.close()
 
 
-def codes(data, at):
-    """An array of 16-bit codes, and where it ends."""
-    (count,) = struct.unpack_from("<I", data, at)
-    return set(struct.unpack_from(f"<{count}H", data, at + 4)), at + 4 + 2 * count
-
-
-def announced(data):
-    """Vendor extension, operations, events, properties of a device info without words on its extension."""
-    (extension,) = struct.unpack_from("<I", data, 2)
-    operations, at = codes(data, 11)
-    events, at = codes(data, at)
-    return extension, operations, events, codes(data, at)[0]
-
-
-def test_it_announces_canons_remote_shooting():
-    with Bench() as bench:
-        info = bench.ask(0x1001)
-        extension, operations, events, properties = announced(info)
-        assert extension == 0xB
-        assert {0x9008, 0x9009, 0x900B, 0x900C, 0x9013, 0x901A, 0x901D, 0x1014, 0x1015, 0x1016, 0x1009} <= operations
-        assert {0xC009, 0x400D} <= events
-        assert {ZOOM, 0xD03D, EVENT_MODE, 0xD029} <= properties
-        assert "Canon PowerShot S5 IS".encode("utf-16-le") in info
-        assert "1-3.2.1.0".encode("utf-16-le") in info
-        assert (bench.get(0xD03D), bench.get(0xD038)) == (129, 27)  # where the digital zoom begins; widest aperture
-        assert bench.ask(0x1014, ZOOM)[-7:] == struct.pack("<BHHH", 1, 0, 134, 1)  # a range from 0 to 134 by 1
-
-
 def get(prop):
     return 0x1015, (prop,), b""
 
@@ -178,22 +150,8 @@ def test_operations(shooting, operations, commands):
         assert bench.lens.commands == commands
 
 
-def test_every_announced_property_can_be_read():
-    with Bench() as bench:
-        for prop in announced(bench.ask(0x1001))[3]:
-            assert bench.ask(0x1014, prop)[:2] == struct.pack("<H", prop)
-            assert bench.ask(0x1015, prop)
-
-
-@pytest.mark.parametrize("code", [0x1001, 0x1004, 0x1005, 0x1007, 0x9013])
-def test_operations_that_return_data_do_so_even_if_it_is_empty(code):
-    with Bench() as bench:
-        assert bench.ask(code, 0x80000001) is not None
-
-
 @pytest.mark.parametrize(
-    ("mode", "interrupts", "checked"),
-    [(1, 1, 0), (2, 1, 0), (3, 1, 1), (4, 1, 1), (5, 1, 1), (6, 0, 0), (7, 0, 1)],
+    ("mode", "interrupts", "checked"), [(1, 1, 0), (2, 1, 0), (3, 1, 1), (4, 1, 1), (5, 1, 1), (6, 0, 0), (7, 0, 1)]
 )
 def test_events_are_sent_or_fetched_by_mode(mode, interrupts, checked):
     with Bench(shooting=False) as bench:

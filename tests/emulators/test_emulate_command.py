@@ -31,8 +31,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.mark.wire
 @pytest.mark.render
 @pytest.mark.parametrize(("rig", "targets"), [
-    ([], "person"),
-    (["--rig", "marked.toml"], "bird"),
+    ([], "person"), (["--rig", "marked.toml"], "bird"),
     (["--rig", "empty.toml"], 'none; [sim] targets = ["person"] has one to follow'),
 ])  # fmt: skip
 def test_it_prints_the_targets(folder, capsys, rig, targets):

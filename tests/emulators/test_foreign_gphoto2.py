@@ -22,25 +22,15 @@ STILL_SIZE = (3264, 2448)
 # Lines that gphoto2 printed of a real camera (camlibs/ptp2/cameras/canon-s5.txt): in both modes, and in shooting mode.
 ALWAYS = (
     "Model: Canon PowerShot S5 IS",
-    "Capture Formats: JPEG",
-    "Display Formats: Association/Directory, Script, DPOF, MS AVI, MS Wave, JPEG, Defined Type, CRW, Unknown(bf01)",
     "Generic Image Capture, No Open Capture, Canon Capture",
     "Event Emulate Mode(0xd045):(readwrite) (type=0x4) Enumeration [1,2,3,4,5,6,7] value:",
     "Size of Output Data from Camera(0xd02e):(read only) (type=0x6) 524288",
-    "Supported Thumb Size(0xd02d):(read only) (type=0x4006) a[4] 119,0,159,0",
     "a[6] 2448,3264,11,0,0,0,",
-    "a[6] 1200,1600,18,0,0,0,",
-    "Camera Owner(0xd033):(readwrite) (type=0x4002) a[0]",
-    "Firmware Version(0xd031):(read only) (type=0x6) 16777472",
-    "Property 0xd406:(readwrite) (type=0xffff) 'Windows'",
 )
 SHOOTING = (
     "Capture Transfer Mode(0xd029):(readwrite) (type=0x4) Enumeration [1,2,3] value:",
     "Image Quality(0xd006):(readwrite) (type=0x2) Enumeration [5,3,2] value:",
     "Image Size(0xd008):(readwrite) (type=0x2) Enumeration [0,1,3,7,2] value:",
-    "Focusing Point(0xd012):(read only) (type=0x4) Enumeration [] value:",
-    "White Balance(0xd013):(readwrite) (type=0x2) Enumeration [0,1,2,3,4,7,5,6] value:",
-    "ISO Speed(0xd01c):(readwrite) (type=0x4) Enumeration [0,69,72,80,88,96,104] value:",
     "Zoom(0xd02a):(readwrite) (type=0x4) Range [0 - 134, step 1] value:",
     "Av Open Apex(0xd038):(read only) (type=0x4) 27",
     "EZoom Start Position(0xd03d):(read only) (type=0x4) 129",
@@ -178,9 +168,3 @@ def test_faults_end_in_an_error_message(gphoto2, camera, fault):
     while gphoto2("--set-config", "capture=1", "--set-config", "zoom=51").returncode:
         assert time.monotonic() < deadline
     assert camera.lens.position() == 51
-
-
-def test_a_summary_is_cut_once(gphoto2, camera):
-    camera.faults.set("cut")
-    assert gphoto2("--summary").returncode != 0
-    said(gphoto2("--summary"))

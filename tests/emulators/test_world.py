@@ -10,14 +10,7 @@ import pytest
 
 from cotarget.config import RigConfig, SimConfig, parse_config
 from cotarget.emulators.serve import JsonLines
-from cotarget.emulators.world import (
-    FIXED_HZ,
-    ZOOM_HZ,
-    EmulatedAxis,
-    EmulatedLens,
-    LiveWorld,
-    paced,
-)
+from cotarget.emulators.world import FIXED_HZ, ZOOM_HZ, EmulatedAxis, LiveWorld, paced
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import pose
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
@@ -72,30 +65,6 @@ def test_a_halt_takes_the_braking_distance_after_the_delay(clock):
     clock.t = 1.6
     assert not plant.moving()
     assert plant.position() == 375 + 20 + 125
-
-
-def test_a_head_without_a_profile_jumps(clock):
-    plant = EmulatedAxis(Axis(math.inf, math.inf), clock, STEP, 0.0)
-    plant.command(700, 500, 1000)
-    assert plant.position() == 700
-    assert not plant.moving()
-
-
-def lens(clock):
-    """Positions 0 to 128."""
-    drive = LensDrive(667.0, 8000.0, 128, True, Axis(129.0, math.inf))
-    return EmulatedLens(drive, clock, DELAY)
-
-
-def test_a_lens_moves_within_its_range(clock):
-    plant = lens(clock)
-    assert plant.last == 128
-    plant.command(500)
-    clock.t = 20.0
-    assert plant.position() == 128
-    plant.command(-3)
-    clock.t = 40.0
-    assert plant.position() == 0
 
 
 def test_real_time_has_lower_rates_and_fewer_effects():
