@@ -8,27 +8,12 @@ from cotarget.rig import Detection, Frame
 from cotarget.sim.targets.random_paths import GROUPED, group_paths, in_view
 from cotarget.sim.truth import Silhouette
 from experiments.following import detectors
-from experiments.following.detectors import MEMORY_S, SHAKES, STANDS, Watch
-from experiments.following.field import five_targets_config
+from experiments.following.detectors import SHAKES, STANDS, Watch
+from experiments.following.field_scenes import five_targets_config
 
 FRAMES, RATE = 100, 25.0
 HALF_SIZE = 0.5  # of a bird or, across, a person, and more [m]
 SIDE = np.array([20.0, 20.0])
-
-
-def test_the_shake_is_as_strong_and_as_slow_as_it_says():
-    shake = detectors.Shake(1.5, np.random.default_rng(0))
-    at = np.array([shake.at(i / RATE) for i in range(20000)])
-    assert at.std(axis=0) == pytest.approx([1.5, 1.5], rel=0.05)
-    expected = np.exp(-1 / RATE / MEMORY_S)
-    assert np.corrcoef(at[1:, 0], at[:-1, 0])[0, 1] == pytest.approx(expected, abs=0.02)
-
-
-def test_a_shaken_picture_is_where_the_shake_is():
-    picture = np.zeros((60, 80, 3), np.uint8)
-    picture[20:30, 30:45] = 255
-    v, u = np.nonzero(detectors.shifted(picture, np.array([3.0, -2.0]))[..., 0] > 127)
-    assert (u.min(), u.max(), v.min(), v.max()) == (33, 47, 18, 27)
 
 
 @pytest.mark.parametrize("kind", GROUPED)

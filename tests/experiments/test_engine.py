@@ -24,19 +24,9 @@ from hypothesis import strategies as st
 from cotarget.errors import ConfigError
 from cotarget.sim.render import opengl
 from experiments.command import choose, main
-from experiments.engine import (
-    ONE_THREAD,
-    TALLY,
-    code_version,
-    csv_of,
-    known_experiments,
-    on_dask,
-    perform,
-    read_rows,
-)
+from experiments.engine import ONE_THREAD, TALLY, code_version, csv_of, known_experiments, perform, read_rows
 from experiments.report import Bound, compare
-from experiments.tables import as_text
-from tests.support.tiny_experiments import KNOWN, TINY, here, here_together, notes, pids, timed
+from tests.support.tiny_experiments import KNOWN, here, here_together, notes, pids
 
 DEADLINE_S = 120.0  # for a program to come as far as it is waited for
 ROOT = Path(__file__).parents[2]
@@ -84,12 +74,6 @@ def test_each_seed_once_and_timings_last(run, tmp_path):
     assert len((folder / "seeds.csv").read_text().splitlines()) == 1 + 4
     assert str(tmp_path / "out" / "report.html") in told
     assert "Values of each seed." in (tmp_path / "out" / "report.html").read_text()
-
-
-def test_the_longest_begin_first(run, tmp_path):
-    known = KNOWN | {"long": lambda: replace(TINY, name="long", one=timed, cost_s=9.0)}
-    assert run("tiny", "long", *noted(tmp_path, "tiny", "long"), "--seeds", "1", known=known)[0] == 0
-    assert notes(tmp_path) == ["alone 0", "job 0"]
 
 
 def test_workers_are_no_more_than_jobs_and_end_before_times_are_measured(tmp_path):
@@ -181,46 +165,25 @@ def test_a_seed_that_fails_is_recorded_and_the_rest_goes_on(run, tmp_path):
     assert not (folder / "000001.txt").exists()
 
 
-def test_figures_that_cannot_be_made_are_named(run):
-    status, told, _ = run("tiny", known={"tiny": lambda: replace(TINY, summarise=min)})
-    assert (status, "the rows give no figures: TypeError" in told) == (1, True)
-
-
 def test_a_goal_that_is_missed_fails_but_not_a_quick_run(run):
     status, told, _ = run("tiny", "--set", "tiny.factor=50", "--seeds", "3")
     assert (status, "missed: total: too much" in told) == (1, True)
     assert run("tiny", "--set", "tiny.factor=50", "--seeds", "3", "--quick", out="quick")[0] == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["tyni"], "tyni"),
-        (["tiny", "--set", "tiny.facto=1"], "tiny.facto"),
-        (["tiny", "--set", "tiny.factor=high"], "tiny.factor"),
-        (["tiny", "--set", "tiny.seeds=0"], "tiny.seeds"),
-        (["tiny", "--set", "tiny.kinds=['none']"], "tiny.kinds"),
-        (["tiny", "--set", "tiny.kinds=[]"], "tiny.kinds"),
-        (["tiny", "--set", "alone.factor=1"], "alone"),
-        (["tiny", "--set", "factor"], "factor"),
-        (["lacking"], "lacking"),
-        (["tiny", "--update-expected"], "--update-expected"),
-        (["tiny", "--report", "--fresh"], "--report"),
-        (["tiny", "--report"], "--report"),
-    ],
-    ids=" ".join,
-)  # fmt: skip
+@pytest.mark.parametrize(("arguments", "named"), [
+    (["tyni"], "tyni"), (["tiny", "--set", "tiny.facto=1"], "tiny.facto"),
+    (["tiny", "--set", "tiny.factor=high"], "tiny.factor"), (["tiny", "--set", "tiny.seeds=0"], "tiny.seeds"),
+    (["tiny", "--set", "tiny.kinds=['none']"], "tiny.kinds"), (["tiny", "--set", "tiny.kinds=[]"], "tiny.kinds"),
+    (["tiny", "--set", "alone.factor=1"], "alone"), (["tiny", "--set", "factor"], "factor"), (["lacking"], "lacking"),
+    (["tiny", "--update-expected"], "--update-expected"), (["tiny", "--report", "--fresh"], "--report"),
+    (["tiny", "--report"], "--report"),
+], ids=" ".join)  # fmt: skip
 def test_mistakes_end_in_one_line_before_any_work(run, tmp_path, arguments, named):
     status, told, complaints = run(*arguments)
     assert (status, told, complaints.count("\n")) == (1, "", 1)
     assert named in complaints
     assert not (tmp_path / "out" / "tiny").exists()
-
-
-def test_a_folder_that_cannot_be_made(run, tmp_path):
-    (tmp_path / "file").touch()
-    status, _, complaints = run("tiny", out="file")
-    assert (status, complaints.count("\n"), str(tmp_path / "file") in complaints) == (1, 1, True)
 
 
 def test_what_cannot_be_done_is_left_out_unless_it_is_named(run, tmp_path):
@@ -242,12 +205,6 @@ def test_results_of_other_settings_or_other_code_are_refused(run, tmp_path):
     assert run("tiny", "--seeds", "2", "--fresh")[0] == 0
     assert "0.0.9" not in log.read_text()
     assert "--fresh" not in (tmp_path / "out" / "report.html").read_text()
-
-
-def test_the_version_tells_code_and_libraries_apart(monkeypatch):
-    monkeypatch.setattr("experiments.engine.libraries_used", lambda: {"numpy": "0"})
-    ours, other = (version.split(".") for version in (code_version(), code_version.__wrapped__()))
-    assert (ours[:-1], ours[-1] != other[-1]) == (other[:-1], True)
 
 
 def test_a_worker_with_other_code_ends_the_run(run, tmp_path):
@@ -276,19 +233,11 @@ def test_bounds_only_tighten(run, tmp_path):
     assert json.loads((tmp_path / "alone.json").read_text()) == {"total": 9.0}  # of times none is written
 
 
-@pytest.mark.parametrize(
-    ("kind", "bound", "good", "bad"),
-    [
-        ("at_most", 0.02, 0.0219, 0.0221),
-        ("at_least", 0.88, 0.81, 0.79),
-        ("at_most", -1.0, -0.95, -0.9),
-        ("at_least", -1.0, -1.05, -1.15),
-        ("within", (0.85, 1.15), 1.14, 1.16),
-        ("within", (0.85, 1.15), 0.86, 0.84),
-        ("at_most", None, 5.0, None),
-        ("at_most", 0.0, 0.0, math.nan),
-    ],
-)
+@pytest.mark.parametrize(("kind", "bound", "good", "bad"), [
+    ("at_most", 0.02, 0.0219, 0.0221), ("at_least", 0.88, 0.81, 0.79), ("at_most", -1.0, -0.95, -0.9),
+    ("at_least", -1.0, -1.05, -1.15), ("within", (0.85, 1.15), 1.14, 1.16), ("within", (0.85, 1.15), 0.86, 0.84),
+    ("at_most", None, 5.0, None), ("at_most", 0.0, 0.0, math.nan),
+])  # fmt: skip
 def test_a_bound_allows_a_tenth(kind, bound, good, bad):
     assert Bound("", kind, bound, good).kept
     assert not Bound("", kind, bound, bad).kept
@@ -310,14 +259,6 @@ def test_a_bound_whose_figure_is_gone_is_broken(tmp_path):
             compare("tiny", {}, tmp_path)
 
 
-def test_figures_as_tables():
-    one = {"median": 1.0, "least": 0.5, "largest": 1234.5}
-    text = as_text({"book": {"yield": one, "size": 2}, "bird": {"yield": dict.fromkeys(one, 0.25), "size": math.nan}})
-    lines = [line.split() for line in text.splitlines()]
-    assert lines == [["yield", "size"], ["book", "1", "(0.5", "to", "1234)", "2"], ["bird", "0.25", "-"]]
-    assert as_text({"a": 1, "b": [2, 3]}).split() == ["a", "1", "b", "2,", "3"]
-
-
 # ---------------------------------------------------------------- what a seed takes
 def test_what_a_seed_takes_is_counted():
     assert TALLY == opengl.TALLY
@@ -334,17 +275,6 @@ def test_what_a_seed_takes_is_counted():
     assert done.cpu_s >= 0.02
     assert TALLY not in os.environ
     assert "a row holds a set" in perform(lambda *_: [{"seed": {0}}], None, 0).failed
-
-
-@pytest.mark.render
-def test_each_picture_is_tallied(tmp_path, monkeypatch):
-    monkeypatch.setenv(opengl.TALLY, str(tmp_path / "tally"))
-    model = opengl.mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
-    canvas = opengl.Canvas(model, (8, 8), shadows=False)
-    for _ in range(2):
-        canvas.draw(np.zeros(3), np.eye(3), (-1.0, 1.0, -1.0, 1.0), (8, 8))
-    canvas.close()
-    assert (tmp_path / "tally").stat().st_size == 2
 
 
 # ---------------------------------------------------------------- workers
@@ -461,12 +391,6 @@ def test_nobody_answers(tmp_path, capsys):
     complaints = capsys.readouterr().err
     assert (status, complaints.count("\n"), "nowhere" in complaints) == (1, 1, True)
     assert len(list((tmp_path / "tiny" / "rows").iterdir())) == 4  # nothing is deleted where nothing can be done
-
-
-def test_without_dask_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ConfigError, match=r"the extra experiments .*dask"), on_dask(1, None):
-        pass
 
 
 # ---------------------------------------------------------------- the real ones

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from cotarget.config import parse_config
 from cotarget.control.head import HeadSettings
-from cotarget.control.selection import FirstCome
 from cotarget.detection import Detections
 from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.geometry import pose
@@ -17,15 +16,14 @@ from cotarget.pipeline import FollowSettings
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
-from experiments.following import delay, field, first_shot, five_targets
-from experiments.following.field import hold_config
+from experiments.following import delay, field, first_shot
+from experiments.following.field_scenes import hold_config
 from experiments.following.first_shot import CAUSES, Shot, budget
 from experiments.following.single_ptz import TruthFinder
 from experiments.following.wide_view import Seen, WideView, open_on, record
 from tests.support.rigs import with_zoom_head
 
 SMALL = 0.03  # relative: products of angles of a hundredth that are taken for sums
-FRAME_S = 0.04
 
 
 def names(texts):
@@ -71,14 +69,6 @@ def test_a_recorded_view_gives_the_same_frames_and_detections():
         assert len(again.detect(recorded).boxes) == 1
 
 
-# ---------------------------------------------------------------- delay
-def test_a_delay_is_shared_as_in_the_field():
-    config = delay.delayed(hold_config("person", 0), 0.6)
-    assert config.sim.fixed.latency_s == config.sim.zoom.latency_s == pytest.approx(0.36)
-    assert config.sim.head.command_delay_s == pytest.approx(0.24)
-    assert delay.delayed(config, 0.2).sim.head.command_delay_s == pytest.approx(0.08)
-
-
 def test_without_prediction_the_offset_is_speed_times_delay(exact, monkeypatch):
     """1.5 m/s and 0.2 s are 0.3 m, of 1.75 m that are 300 px large: 51 px of 640, and a frame or two more on the way.
 
@@ -116,8 +106,7 @@ def offsets_of_who_stops(exact, delay_s, closed_loop, seed=SEED):
     truth = world.truth()
     detector = TruthDetector(truth, seed, TruthNoise(0.5, 0.04, 0.05))
     how = FollowSettings(
-        closed_loop=closed_loop,
-        finder=lambda calibration, target: TruthFinder(calibration, target, truth, "person", 0),
+        closed_loop=closed_loop, finder=lambda calibration, target: TruthFinder(calibration, target, truth, "person", 0)
     )
     target, end = config.target("person"), SETTLED[1]
     steps = [step for step, _ in field.watched_in(world, detector, exact, target, end, how)]
@@ -152,21 +141,6 @@ def test_the_head_swings_no_more_than_once_a_seed_seen_late(exact):
     ends = [offsets_of_who_stops(exact, 0.6, closed_loop=True, seed=seed)[1] for seed in range(8)]
     assert sum(swings(axis) for after in ends for axis in after.T) <= len(ends)
     assert max(np.linalg.norm(after, axis=1).max() for after in ends) < 1.5 * ZONE
-
-
-# ---------------------------------------------------------------- five targets
-def test_good_seconds_agree_with_the_rows(exact):
-    config = hold_config("person", 1)
-    target, how = config.target("person"), FollowSettings(closed_loop=False)
-    view = seen_well(config, target, 4.0)
-    found = five_targets.good_seconds(exact, config, target, 4.0, how, view, FirstCome())
-    rows = field.held(exact, config, "person", 4.0, how, view)
-    assert found.keys() == {"person"}
-    assert found["person"] == pytest.approx(FRAME_S * sum(row.closeup.good for row in rows[1:]))
-    assert found["person"] > 0
-
-
-# ---------------------------------------------------------------- dead zone
 
 
 # ---------------------------------------------------------------- first shot

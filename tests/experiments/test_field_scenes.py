@@ -12,7 +12,6 @@ from cotarget.sim.world import SimWorld
 from experiments.following.field import five_targets_config, hold_config
 
 SEEDS = (0, 1, 2, 100, 101)
-NAMES = ("book", "person", "bird")
 STEP = 0.04
 TIMES = np.arange(0.0, SECONDS + STEP / 2, STEP)
 MOUNT = np.array([0.0, 0.0, 1.6])
@@ -50,25 +49,6 @@ def test_the_book_is_put_elsewhere_once():
         assert 0.8 < moving.sum() * STEP < 1.7
         assert 1.4 < np.linalg.norm(x[-1] - x[0]) < 4.1
         assert seen_wholly(truth, "book", TIMES[::10]).all()
-
-
-@pytest.mark.slow
-def test_the_person_walks_at_ten_metres():
-    for seed in SEEDS:
-        x, truth = track("person", seed)
-        assert speeds(x) == pytest.approx(1.5, abs=0.08)
-        seen = seen_wholly(truth, "person", TIMES)
-        first = int(seen.argmax())
-        assert 1.0 < TIMES[first] < 3.5  # it comes in
-        assert seen[first:].all()  # and stays
-        distance = np.linalg.norm((x - MOUNT)[first:, :2], axis=1)
-        assert distance.min() > 8.8
-        assert distance.max() < 12.0
-        assert np.median(distance) == pytest.approx(10.2, abs=0.4)
-        stature = 1.75 * truth.targets["person"].size
-        assert abs(stature - 1.75) <= 0.0701
-        assert [z for *_, z in hold_config("person", seed).sim.paths["person"]] == pytest.approx([stature / 2] * 251)
-        assert np.abs(x[:, 2] - stature / 2).max() < 0.05  # a step's rise and fall
 
 
 def test_the_bird_flies_fast_wide_turns_and_stays_in_view():

@@ -30,26 +30,6 @@ def test_each_picture_is_taken_at_the_width_of_a_page(results, tmp_path, capsys)
     assert len(capsys.readouterr().out.splitlines()) == len(written)
 
 
-def test_some_are_taken_alone(results, tmp_path, capsys):
-    command = ["--results", str(results), "--out", str(tmp_path / "out")]
-    assert main(["hold", "fig4_book", *command]) == 0
-    assert sorted(path.stem for path in (tmp_path / "out").iterdir()) == ["fig4", "fig4_as_the_paper", "hold"]
-    assert main(["hole", *command]) == 1
-    assert "'hole' is not one of: " in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("harm", [lambda path: path.unlink(), lambda path: path.write_bytes(b"no picture")])
-def test_without_one_none_is_written(results, tmp_path, capsys, harm):
-    last = SHOWN[-1]
-    lacking = results / last.experiment / f"{last.picture}.png"
-    harm(lacking)
-    assert main(["--results", str(results), "--out", str(tmp_path / "out")]) == 1
-    error = capsys.readouterr().err
-    assert str(lacking) in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_results_page_shows_them_all_and_no_other():
     page = ROOT / "docs" / "results.md"
     shown = re.findall(r"\]\((pictures/\S+\.jpg)\)", page.read_text(encoding="utf-8"))

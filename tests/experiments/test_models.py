@@ -5,19 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from cotarget.geometry import RigidTransform, pose
-from experiments.calibration import calibration_budget
 from experiments.calibration.synthetic.aims import looking_off
 from experiments.calibration.synthetic.rig import Lens, Truth
 from experiments.following import depth_error, models, shortcut
-from experiments.following.mounted import (
-    at,
-    exact_calibration,
-    idealised,
-    mounted,
-)
+from experiments.following.mounted import at, exact_calibration, idealised, mounted
 from experiments.following.simpler import (
     CRUDE_OFFSET,
     FULL,
@@ -118,15 +111,6 @@ def test_the_regime_reaches_as_far_as_the_full_model_is_five_times_better():
     assert none == [f"{c}: full model 5 times better than {o}" for c in models.CONDITIONS for o in models.OPPONENTS]
 
 
-def test_targets_at_the_depth_of_the_zeros_alone_leave_a_picture():
-    """Zeroed, no offset is seen there: their reach is infinite, and not to be drawn."""
-    far = [row | {"reach": math.inf} if row["model"] in ZEROED.values() else row for row in error_rows({50.0: 9.0})]
-    models.plot(far, figure := Figure())
-    ignored, zeroed = figure.axes[2], figure.axes[5]
-    assert [bars.get_label() for bars in ignored.containers] == list(models.CONDITIONS)
-    assert zeroed.containers == []
-
-
 def test_a_depth_error_turns_the_line_of_sight_by_the_baseline_over_the_depth():
     x = np.array([[0.0, 0.0, 10.0]])
     calibration = exact_calibration(BESIDE)
@@ -135,30 +119,6 @@ def test_a_depth_error_turns_the_line_of_sight_by_the_baseline_over_the_depth():
     # And it is the derivative of what really happens.
     off = looking_off(BESIDE, x, depth_error.aim(calibration, x * 1.001))[0]
     assert off == pytest.approx(1e-3 * arm, rel=2e-3)
-
-
-def test_depths_are_measured_by_the_size():
-    x = np.array([[0.0, 0.0, 10.0], [1.0, 0.5, 10.0]])
-    px, sizes = PLAIN.project(x), np.full(2, depth_error.TARGET.size)
-    calibration = exact_calibration(BESIDE)
-    exact = depth_error.measured_depths(calibration, BESIDE, px, x, sizes, np.zeros(2))
-    assert exact == pytest.approx([10.0, 10.0])
-    smaller = depth_error.measured_depths(calibration, BESIDE, px, x, sizes / 1.1, np.zeros(2))
-    assert smaller == pytest.approx([11.0, 11.0])
-    # 0.8 m at 10 m is 40 px: one more is 1/41 nearer.
-    noisy = depth_error.measured_depths(calibration, BESIDE, px, x, sizes, np.ones(2))
-    assert noisy == pytest.approx([10.0 * 40 / 41] * 2)
-
-
-def test_the_exact_range_is_exact_and_the_shortcut_worse_the_farther_off_the_axis():
-    settings = replace(shortcut.SETTINGS, depths=(10.0,), grid=(5, 3), near=8, rigs=("mounted",))
-    rows = shortcut.one(settings, 0)
-    assert len(rows) == 15 + 8
-    assert max(row["exact_deg"] for row in rows) < shortcut.ROUNDING_DEG
-    by_angle = sorted(rows, key=lambda row: row["off_axis_deg"])
-    for method in ("paper-table", "paper-example"):
-        assert by_angle[0][f"{method}_deg"] < 0.2 < 1.0 < by_angle[-1][f"{method}_deg"]
-    shortcut.plot(rows, Figure())
 
 
 def test_the_worked_examples_rig_errs_as_the_worked_example_does():
@@ -170,10 +130,3 @@ def test_the_worked_examples_rig_errs_as_the_worked_example_does():
     for method, px in (("paper-table", 33.5), ("paper-example", 2.6)):
         q = np.array([shortcut.aimed(exact_calibration(truth), x[0], reach, method)])
         assert 7155 * math.tan(looking_off(truth, x, q)[0]) == pytest.approx(px, abs=0.1)
-
-
-def test_exponents_are_fitted_to_the_rows():
-    rows = [{"noise_px": n, "placements": 4 * n, "reached_px": 3.0 * n} for n in (1.0, 2.0)]
-    fitted = calibration_budget.exponents([*rows, rows[0] | {"placements": 16, "reached_px": 1.5}])
-    assert fitted == pytest.approx((1.5, -0.5))  # 3 to 6 from 1 px and 4 placements to 2 px and 8, to 1.5 with 16
-    assert np.isnan(calibration_budget.exponents([rows[0] | {"placements": n} for n in (4, 8)])[0])  # of one noise

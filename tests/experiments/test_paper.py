@@ -2,18 +2,14 @@
 
 import math
 import re
-from collections import namedtuple
-from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
 from cotarget.metrics import Closeup
 from cotarget.pantilt import base_head, solve
-from experiments.paper import fig4_book, fig6_outdoors, table2_table3, worked_example
+from experiments.paper import table2_table3, worked_example
 from experiments.paper.fig6_outdoors import Moment, figures
-from experiments.paper.paper_loop import GAP_PX, WIDTH_PX, laid_out
 
 ROUNDING = 1e-9  # relative, or of millimetres of ten metres
 
@@ -89,31 +85,7 @@ def test_the_tables_have_the_papers_layout():
     np.testing.assert_allclose(found, [[0, 0, 1, -400], [0, 1, 0, 30], [-1, 0, 0, 60], [0, 0, 0, 1]], atol=1e-4)
 
 
-def test_the_tables_of_a_rig_of_ones_own_tell_nothing_of_the_papers_cameras(tmp_path):
-    """Its zoom camera's pitch is what its rig.toml says: 693 px of 0.02 mm are 13.86 mm. Of the fixed one none is."""
-    path = tmp_path / "rig.toml"
-    path.write_text("[sim.zoom]\npitch_mm = 0.02\n")
-    settings = replace(table2_table3.SETTINGS, seeds=2, rig=str(path))
-    text = table2_table3.describe(settings, table2_table3.summarise(rows_of((1.0, -1.0))))
-    head, zoom, zoom_true, fixed, fixed_true = text.splitlines()[1:6]
-    assert "CCD" not in head
-    assert re.search(r"^ *zoom camera +\[693.10 ± 0.10, 692.10 ± 0.10\] +\[13.8620 ± 0.0020, ", zoom)
-    assert re.search(r"^ +true +\[693.000, 692.000\] +\[13.8600, 13.8400\] +\[235.000, 326.000\] +0.02$", zoom_true)
-    assert re.search(r"^ *fixed camera +\[684.10 ± 0.10, 686.10 ± 0.10\] +- +\[239.10 ± 0.10, [^]]+\] +-$", fixed)
-    assert re.search(r"^ +true +\[684.000, 686.000\] +- +\[239.000, 325.000\] +-$", fixed_true)
-    for of_the_paper in ("Canon", "Philips", "as printed", "5.74", "0.009", "stands in"):
-        assert of_the_paper not in text
-
-
 # ---------------------------------------------------------------- Fig. 4 to 6
-
-
-def test_before_is_when_the_book_was_found():
-    Found = namedtuple("Found", "target")
-    nothing, found, later = Found(None), Found(1), Found(2)
-    assert fig4_book.first_and_last(iter([nothing, nothing, found, later])) == (found, later)
-    assert fig4_book.first_and_last(iter([found, later])) == (found, later)
-    assert fig4_book.first_and_last(iter([nothing, nothing])) == (nothing, nothing)
 
 
 def moment(t, followed, present, u=319.5, size=300.0):
@@ -141,23 +113,3 @@ def test_fig_6_notices_who_is_left_too_early():
     assert (found["too_early"], found["off_target_s"]) == (1, 0.25)
     assert found["in_frame"] == pytest.approx(8 / 9)  # nobody is, meanwhile
     assert figures(run[:2])["handover_s"] is None
-
-
-def test_fig_6_a_track_stays_whose_it_was_while_it_is_on_them():
-    """`b` passes `a`, and is nearer for a while; when it has taken the track along, that is `b`'s."""
-    watch, told = fig6_outdoors.Watch(), []
-    for on in (["a"], ["b", "a"], [], ["b"], ["a", "b"]):
-        watch.assign(5, on)
-        told.append(watch.names[5])
-    assert told == ["a", "a", "a", "b", "b"]
-
-
-def test_panels_stand_in_rows_with_gaps():
-    grey, blue = np.full((240, 320), 128, np.uint8), np.full((480, 640, 3), (200, 0, 0), np.uint8)
-    picture = cv2.imdecode(np.frombuffer(laid_out([[(grey, "a"), (blue, "b")]] * 2), np.uint8), cv2.IMREAD_COLOR)
-    height = WIDTH_PX * 3 // 4
-    assert picture.shape[1] == 2 * (WIDTH_PX + GAP_PX)
-    assert picture.shape[0] > 2 * height
-    assert picture[height // 2, WIDTH_PX // 2].tolist() == [128, 128, 128]
-    assert picture[height // 2, WIDTH_PX + GAP_PX + WIDTH_PX // 2].tolist() == [200, 0, 0]
-    assert picture[height // 2, WIDTH_PX + GAP_PX // 2].min() > 200

@@ -5,7 +5,7 @@ import pytest
 
 from cotarget.track_metrics import Label, Tracked
 from experiments.following import sim_to_real
-from experiments.following.sim_to_real import appearance, draw_flyer, fitted, stratum
+from experiments.following.sim_to_real import appearance, fitted, stratum
 
 SHAPE = (120, 160)
 RATE = 30.0
@@ -28,10 +28,8 @@ def label(u, v, width, height, target=1):
 
 
 @pytest.mark.parametrize(("side", "contrast", "texture", "speed", "expected"), [
-    (12.0, 4.9, 8.0, 23.9, "up to 12 px, faint, slow, sky"),
-    (12.1, 5.0, 8.1, 24.2, "12-24 px, clear, fast, trees"),
-    (60.0, 9.0, 3.0, 0.0, "24-60 px, clear, slow, sky"),
-    (61.0, 0.0, 30.0, 500.0, "over 60 px, faint, fast, trees"),
+    (12.0, 4.9, 8.0, 23.9, "up to 12 px, faint, slow, sky"), (12.1, 5.0, 8.1, 24.2, "12-24 px, clear, fast, trees"),
+    (60.0, 9.0, 3.0, 0.0, "24-60 px, clear, slow, sky"), (61.0, 0.0, 30.0, 500.0, "over 60 px, faint, fast, trees"),
 ])  # fmt: skip
 def test_a_box_belongs_to_the_stratum_of_its_figures(side, contrast, texture, speed, expected):
     assert stratum(side, contrast, texture, speed) == expected
@@ -46,16 +44,6 @@ def test_contrast_is_the_difference_to_the_ring_over_its_standard_deviation():
     assert contrast == pytest.approx(30 / NOISE, rel=0.1)
 
 
-def test_each_box_has_its_stratum_by_frame_and_target():
-    scene = sky()
-    scene[50:60, 70:80] -= 30
-    labels = {k: [label(74.5, 54.5, 10, 10), label(20 + k, 20, 8, 8, 2)] for k in range(7)}  # 30 px/s, 3.75 sides/s
-    found = sim_to_real.strata([grey(scene)] * 7, labels, RATE)
-    assert found[3, 1] == "up to 12 px, clear, slow, sky"
-    assert found[3, 2] == "up to 12 px, faint, fast, sky"
-    assert len(found) == 14
-
-
 def test_a_label_that_is_too_large_is_fitted_to_the_blob_in_it():
     scene = sky()
     scene[40:46, 100:112] += 40  # 12 x 6 px around (105.5, 42.5)
@@ -64,20 +52,6 @@ def test_a_label_that_is_too_large_is_fitted_to_the_blob_in_it():
     assert box.target == 5
     assert box.center_px == pytest.approx([105.5, 42.5], abs=FITTED_PX)
     assert box.size_px == pytest.approx([12, 6], abs=FITTED_PX)
-
-
-def test_a_label_in_which_nothing_contrasts_is_dropped():
-    labels = {0: [label(60, 60, 30, 30)], 1: []}
-    assert sim_to_real.fitted_labels([grey(sky())] * 2, labels) == {0: [], 1: []}
-
-
-def test_the_box_of_a_made_flyer_is_where_it_is_drawn():
-    image = np.full((*SHAPE, 3), 200, np.uint8)
-    box = draw_flyer(image, np.array([80.3, 60.7]), 30.0, 0.5, np.array([40.0, 40.0, 40.0]))
-    assert box.size_px[0] == pytest.approx(30 * np.cos(0.5))  # from tip to tip
-    found = fitted(image[..., 0], label(80, 60, 60, 50))
-    assert found.center_px == pytest.approx(box.center_px, abs=FITTED_PX)
-    assert found.size_px == pytest.approx(box.size_px, abs=2 * FITTED_PX)  # the tips are thin
 
 
 def test_boxes_are_counted_from_frame_30_on():

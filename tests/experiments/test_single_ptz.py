@@ -9,12 +9,10 @@ import pytest
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detections
 from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
-from cotarget.rig import Frame
 from cotarget.sim.truth import Outlines
 from cotarget.sim.world import SimWorld
 from experiments.following import single_ptz
 from experiments.following.lone_camera import COAST_S, SEARCH_S, Course, LoneCamera, Sighting, scan_of
-from experiments.following.single_ptz import Shaken
 
 BOOK = DEFAULT_TARGETS["book"]
 STEP = 0.04
@@ -36,13 +34,6 @@ def test_a_course_leads_by_its_velocity():
     assert course.at(2.0)[1][0] > 10 * variances[0]
     course.saw(Sighting(9.0, 1.0, 0.0, (side, side / 2), False), 700.0)  # after that long, begun anew
     assert course.at(9.0)[0] == pytest.approx((1.0, 0.0))
-
-
-def test_a_clipped_sighting_gives_no_size():
-    course = Course(BOOK, 0.5)
-    course.saw(Sighting(0.0, 0.0, 0.0, (0.02, 0.01), False), 700.0)
-    course.saw(Sighting(STEP, 0.0, 0.0, (0.005, 0.01), True), 700.0)
-    assert course.sides == (0.02, 0.01)
 
 
 @pytest.fixture
@@ -70,18 +61,6 @@ def test_a_scan_sees_all_that_the_wide_camera_does(size):
         near = (np.abs(poses[:, 0] - pan) < across) & (np.abs(poses[:, 1] - tilt) < down)
         assert near.any(), np.degrees([pan, tilt])
     assert len(poses) == SCAN_POSES  # and no more than that
-
-
-def test_a_run_without_a_start_does_not_change_the_other_figures():
-    """A person is not wholly in view yet after the least time that can be asked for."""
-    rows = [
-        {"seed": seed, "target": "person", "way": "pair"} | single_ptz.figures(judged, "pair")
-        for seed, judged in enumerate([single_ptz.held("pair", "person", 0, 2.1, 0.05), []])
-    ]
-    assert all(row[key] in (None, 0.0, 1.0) for row in rows for key in single_ptz.FIGURES)
-    well = dict(rows[0], closeup_yield=0.6, in_frame_of_all=0.7, watched=0.1)
-    found = single_ptz.summarise([*rows, well])["person"]["pair"]
-    assert (found["closeup_yield"], found["in_frame_of_all"]) == (0.6, 0.7)
 
 
 class Blind:
@@ -126,28 +105,3 @@ def test_after_losing_its_target_the_camera_zooms_out_searches_and_scans(world):
     assert set(sent) & set(field)
     close = max(focal for t, _, focal in modes if t < lost)
     assert close > 3 * modes[-1][2]
-
-
-def held(way, name, seconds=5.0, miss=0.05):
-    return single_ptz.figures(single_ptz.held(way, name, 1, seconds, miss), way)
-
-
-def test_a_lone_camera_finds_and_holds_a_book():
-    found = held("lone", "book")
-    assert found["in_frame_ratio"] > 0.95
-    assert 0.2 < found["time_to_acquire_s"] < 2.0  # four detections, and the delays
-    assert found["watched"] < 0.4  # of the field, after it was found
-
-
-def test_the_picture_moves_when_the_head_does(world):
-    truth = world.truth()
-    shaken = Shaken(Outlines(truth, still=True), truth, 0, 1.0)
-    image = np.zeros((480, 640, 3), np.uint8)
-    world.rig.clock.sleep_until(1.0)
-    assert not shaken.moves(0.5)
-    world.rig.head.move(0.5, 0.0)
-    world.rig.clock.sleep_until(1.6)
-    assert shaken.moves(1.3)
-    assert shaken.misses(1.3)
-    assert np.mean([shaken.misses(0.5 + i * 1e-3) for i in range(100)]) < 0.2  # of a picture that stands, 5 %
-    assert shaken.detect(Frame(image, 1.3)).boxes == []

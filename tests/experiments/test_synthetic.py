@@ -7,8 +7,7 @@ import pytest
 
 from cotarget.geometry import RigidTransform, pose
 from experiments.calibration.synthetic.aims import aimed
-from experiments.calibration.synthetic.rig import SIZE, Lens, Truth, undistorted, with_lever_shifted
-from experiments.calibration.synthetic.views import Placing, spread_views
+from experiments.calibration.synthetic.rig import Lens, Truth, undistorted, with_lever_shifted
 
 STILL = RigidTransform.identity()
 PLAIN = Lens(500.0, 500.0, 320.0, 240.0)
@@ -29,11 +28,6 @@ def test_undistorting_is_the_inverse_of_projecting(lens):
     xy = undistorted(pixels, lens)
     assert np.allclose(lens.project(np.c_[xy, np.ones(4)]), pixels, rtol=0, atol=1e-7)
     assert np.allclose(undistorted(pixels[1], lens), xy[1])
-
-
-def test_an_equidistant_fisheye():
-    lens = replace(PLAIN, distortion=(0, 0, 0, 0), fisheye=True)
-    assert np.allclose(lens.project([[np.tan(0.3), 0.0, 1.0]]), [[320.0 + 500.0 * 0.3, 240.0]])
 
 
 def test_where_the_head_stands():
@@ -66,18 +60,3 @@ def test_aiming_at_points_one_each():
     assert np.allclose(np.abs(aimed(PLAIN_RIG, x, rays)[:2]), [[np.pi / 4, 0.0], [0.0, np.arctan(0.5)]])
     x_zoom = Truth().in_zoom(x[:2] * 5, *aimed(Truth(), x[:2] * 5, rays).T)
     assert np.allclose(x_zoom[:, :2] / x_zoom[:, 2:], 0.0, atol=ROUNDING)
-
-
-def test_boards_are_spread_and_seen():
-    points = np.array([[x, y, 0.0] for y in (0.0, 0.5) for x in (0.0, 0.8)])
-    placing = Placing(boards=15, looks=3)
-    views = spread_views(Truth(), points, np.random.default_rng(0), 0.0, placing)
-    assert len(views) == 15 * 4
-    for view in views:
-        assert ((view.corners_px >= 0) & (view.corners_px <= np.array(SIZE) - 1)).all()
-    fixed = np.concatenate([view.corners_px for view in views if view.camera == "fixed"])
-    assert (fixed.min(axis=0) < [60, 60]).all()
-    assert (fixed.max(axis=0) > [580, 420]).all()
-    shape = points + np.array([[0.01], [0.0], [0.0], [0.01]]) * [0.0, 0.0, 1.0]
-    bent = spread_views(Truth(), points, np.random.default_rng(0), 0.0, placing, shape=shape)
-    assert not np.allclose(bent[0].corners_px, views[0].corners_px, atol=0.01)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.wire import age, command, faults, latency, wire
+from experiments.wire import command, faults, latency, wire
 from experiments.wire.command import Notes, Turn
 from experiments.wire.rig import Tap
 from experiments.wire.wire import summarise
@@ -64,27 +64,6 @@ def test_true_delays_of_commands():
     tap, notes = Tap(None, None), Notes(None, 0.0, [Turn(2.0, 2.0), Turn(5.0, 5.0)])
     tap.written = [(1.9, b"PP7 "), (2.005, b"PP "), (2.01, b"PS100 "), (2.02, b"PP-96 "), (2.03, b"TP8 ")]
     assert latency.true_command_delays(notes, tap, 0.04) == pytest.approx([0.02 + 6 / 960 + 0.04])
-
-
-def test_the_number_in_a_picture_can_be_read():
-    assert [age.number_of(age.picture(number)) for number in (0, 1, 130, 255)] == [0, 1, 130, 255]
-
-
-def test_directions_of_the_book():
-    """By hand: at 3 s the book is 1.2 m left, 6 m away, as high as the cameras; the zoom camera is 0.4 m right."""
-    pan, tilt = faults.directions(3.0)
-    assert pan == pytest.approx(-math.degrees(math.atan2(1.2 + 0.4, 6.0)), abs=3.0)
-    assert abs(tilt) < 3.0
-    assert faults.directions(0.0) == pytest.approx(faults.directions(6.0))
-    assert faults.directions(0.0)[0] - pan == pytest.approx(2 * math.degrees(math.atan2(1.2, 6.0)), abs=1.5)
-    assert faults.directions(1.5)[1] - faults.directions(4.5)[1] == pytest.approx(11.4, abs=1.0)
-
-
-def test_the_last_time_off_the_book():
-    watch = faults.Watch(None)
-    watch.times, watch.off = [0.0, 0.1, 0.2, 0.3], [1.0, 9.0, 7.0, 1.0]
-    assert watch.strayed(0.05) == 0.2
-    assert watch.strayed(0.25) == 0.25
 
 
 def stalled(settled_s, hang=0):
