@@ -6,10 +6,9 @@ import pytest
 
 from cotarget.config import TargetProfile
 from cotarget.detection import AutoDetector, BackgroundDetector, make_detector
-from cotarget.detection.auto import Clutter, by_shape, fuse
 from cotarget.detection.background import LARGE
 from cotarget.pipeline import CameraRun
-from cotarget.rig import Detection, Frame
+from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 from tests.support.noise import noisy
@@ -80,13 +79,13 @@ def test_a_person_who_stands_is_held_for_a_minute():
 def test_an_own_target_of_any_shape_is_found(size):
     rng, rate = np.random.default_rng(2), 25.0
     background, surface = scenery((640, 480), rng), texture(*size, rng)
-    places = [None] * 10 + [(40 + 4 * i, 300) for i in range(100)]
+    places = [None] * 10 + [(40 + 4 * i, 300) for i in range(60)]
     tracks = follow(moved(background, surface, places), rate, rng)
     right = [
         on(each, np.array(place) + np.array(size) / 2, 6) for each, place in zip(tracks, places, strict=True) if place
     ]
     assert np.mean([bool(each) for each in right[10:]]) >= FOUND
-    assert right[50][0].size_px == pytest.approx(size, rel=0.3)
+    assert right[40][0].size_px == pytest.approx(size, rel=0.3)
     assert len({track.id for each in right for track in each}) == 1
 
 
@@ -136,7 +135,7 @@ def test_a_large_target_before_a_plain_wall_is_not_taken_for_the_cameras_motion(
 
 def test_a_target_that_grows_from_a_speck_keeps_its_number():
     rng, rate = np.random.default_rng(3), 25.0
-    background, lengths = scenery((640, 480), rng), np.geomspace(4, 320, 200)
+    background, lengths = scenery((640, 480), rng), np.geomspace(4, 320, 120)
     pictures = []
     for i, length in enumerate(lengths):
         picture = background.copy()
@@ -180,30 +179,6 @@ def test_a_nudge_of_the_camera_costs_three_tenths_of_a_second():
     assert sum(lost[60:]) <= 0.3 * rate
 
 
-def detection(u, v, w, h, score):
-    return Detection(np.array([u, v], dtype=float), np.array([w, h], dtype=float), score)
-
-
-def test_parts_of_a_large_target_are_not_listed_beside_it():
-    head, shoe, other = detection(100, 60, 10, 10, 0.9), detection(98, 148, 8, 4, 0.6), detection(200, 100, 10, 10, 0.7)
-    person = detection(100, 100, 30, 100, 0.3)
-    assert [
-        (each.size_px.tolist(), each.score) for each in fuse([head, shoe, other], [False] * 3, [False] * 3, [person])
-    ] == [
-        ([30, 100], 0.9),
-        ([10, 10], 0.7),
-    ]
-    aeroplane, front = detection(300, 100, 120, 60, 0.8), detection(255, 100, 30, 60, 0.3)
-    assert [each.size_px.tolist() for each in fuse([aeroplane], [False], [False], [front])] == [
-        [120, 60]
-    ]  # its front alone has changed
-    bird, cloud = detection(110, 90, 12, 8, 0.9), detection(100, 100, 60, 50, 0.3)
-    assert [(len(fuse([bird], [False], [own], [cloud])), own) for own in (False, True)] == [(1, False), (2, True)]
-    outline = detection(100, 100, 34, 104, 0.8)
-    assert [each.size_px.tolist() for each in fuse([outline], [True], [False], [person])] == [[34, 104]]
-    assert [each.size_px.tolist() for each in fuse([outline], [False], [False], [person])] == [[30, 100]]
-
-
 def test_the_foreground_of_a_large_target_has_its_outline_and_no_boxes_of_its_parts():
     """Where a body is in its box, for the close-up, is measured by the foreground. It walks by, thin as a diamond."""
     rng, rate = np.random.default_rng(4), 25.0
@@ -223,24 +198,6 @@ def test_the_foreground_of_a_large_target_has_its_outline_and_no_boxes_of_its_pa
     assert np.mean(on_body) > 0.8 * body.sum()
 
 
-def test_what_sways_at_one_place_loses_its_score_and_what_flies_through_does_not():
-    """By hand: after 10 s the usual score is 0.6 (1 - 1/e) = 0.38, which divides the odds of 1.5 by 1 + 0.38 / 0.03. A
-    target that crosses a cell in four frames has seen itself there."""
-    clutter = Clutter()
-    twig, place = detection(400, 300, 4, 4, 0.6), (np.array([400.0, 300.0]), np.array([20.0, 20.0]))
-    for i in range(251):
-        scores = {
-            each.center_px[1]: each.score
-            for each in clutter.weigh([twig, detection(2 * i, 100, 4, 4, 0.6)], i / 25, 640, [])
-        }
-        if i == 0:
-            assert scores == {300: pytest.approx(0.6), 100: pytest.approx(0.6)}
-    assert scores == {300: pytest.approx(0.1, abs=0.01), 100: pytest.approx(0.5, abs=0.02)}
-    assert clutter.weigh([twig], 10.04, 640, [place])[0].score == 0.6  # a target is followed there
-    clutter.weigh([], 30.0, 640, [])  # the first image after a pause
-    assert clutter.weigh([twig], 30.04, 640, [])[0].score < 0.15
-
-
 def test_frames_that_come_twice_hide_no_clutter():
     """A leaf that turns at its place scores as in the same film with every frame once."""
     background = scenery((480, 360), np.random.default_rng(8))
@@ -254,8 +211,9 @@ def test_frames_that_come_twice_hide_no_clutter():
             found.append(first)
         return [max((each.score for each in boxes), default=0.0) for boxes in found[50:]]
 
-    assert max(scores(1)) < 0.4
-    assert scores(2) == pytest.approx(scores(1), abs=0.02)
+    once = scores(1)
+    assert max(once) < 0.4
+    assert scores(2) == pytest.approx(once, abs=0.02)
 
 
 def test_a_person_is_found_as_soon_where_frames_come_twice():
@@ -280,7 +238,7 @@ def test_the_place_that_a_target_has_left_is_no_target():
     """A car stood there when the background was learnt; it drives off, and leaves a ghost in the background model."""
     rng, rate = np.random.default_rng(6), 25.0
     background, surface = scenery((640, 480), rng), texture(60, 24, rng)
-    places = [(100, 300)] * 50 + [(100 + 6 * i, 300) for i in range(80)]
+    places = [(100, 300)] * 50 + [(100 + 6 * i, 300) for i in range(50)]
     tracks = follow(moved(background, surface, places), rate, rng)
     assert all(on(each, np.add(place, [29.5, 11.5]), 6) for each, place in zip(tracks[75:], places[75:], strict=True))
     assert not any(on(each, (129.5, 311.5), 20) for each in tracks[75:])
@@ -290,7 +248,7 @@ def test_sunlight_on_the_ground_beside_a_large_target_is_no_part_of_it():
     """The lit strip is smaller than the car that drives along it."""
     rng, rate, size = np.random.default_rng(2), 25.0, (220, 140)
     background, surface = scenery((640, 480), rng), texture(*size, rng)
-    places = [None] * 10 + [(40 + 3 * i, 300) for i in range(120)]
+    places = [None] * 10 + [(40 + 3 * i, 300) for i in range(90)]
     pictures = []
     for i, place in enumerate(places):
         lit = background.copy()
@@ -400,27 +358,6 @@ def test_what_the_image_shows_is_learnt_beside_places_that_are_held_outside_of_i
     assert len(found[12].boxes) == 1
     assert not found[-1].boxes
     assert not found[-1].mask.any()
-
-
-def test_a_place_that_is_held_may_lie_outside_the_image():
-    """A track near the border, and a camera that has been nudged."""
-    rng, rate = np.random.default_rng(8), 25.0
-    detector = BackgroundDetector(LARGE, rate)
-    places = [(np.array([u, 100.0]), np.array([10.0, 10.0])) for u in (-300.0, 700.0)]
-    picture = scenery((640, 480), rng)
-    for i in range(20):
-        assert not detector.subtract(Frame(picture.astype(np.uint8), i / rate), places, np.array([5.0, 0.0])).boxes
-
-
-@pytest.mark.parametrize(("size", "score"), [
-    ((40, 100), 0.5),  # the expected shape
-    ((70, 100), 0.5),  # a stride, or two persons side by side
-    ((100, 100), 0.288),  # N(ln 2.5; 0.5) / N(0; 1) = 0.373; 95 % of it and 5 % are odds of 0.404
-    ((300, 100), 0.049),  # a person lies in one of twenty cases
-], ids=["usual", "wide", "square", "lying"])  # fmt: skip
-def test_an_unusual_shape_makes_a_target_less_likely(size, score):
-    found = Detection(np.array([100.0, 100.0]), np.array(size, dtype=float), 0.5)
-    assert by_shape(found, 0.4) == pytest.approx(score, abs=0.001)
 
 
 @pytest.mark.parametrize(("shape", "width"), [(0.4, (25, 42)), (None, (60, 130))])

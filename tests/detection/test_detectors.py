@@ -15,7 +15,7 @@ from cotarget.detection import (
     color_template,
     make_detector,
 )
-from cotarget.detection.background import FLOODED_S, pieces
+from cotarget.detection.background import FLOODED_S
 from cotarget.detection.base import MOST_FOREGROUND, flood
 from cotarget.detection.color_template import LARGEST_FITTED_PX, MARGIN_PX, MOST_FITTED, fit_template
 from cotarget.errors import ConfigError, CotargetError
@@ -190,19 +190,6 @@ def test_a_box_at_the_border_is_marked():
     np.testing.assert_allclose(box.center_px, (3.5, 104.5), atol=0.5)
 
 
-@pytest.mark.parametrize("bridge", [(5, 5), (5, 15)])
-def test_pieces_are_those_of_the_whole_bridged_mask(bridge):
-    """Wherever they lie, in the corners too: another of OpenCV's functions gives the same boxes."""
-    rng = np.random.default_rng(0)
-    for few in (0, 1, 2, 5, 20):
-        mask = np.zeros((48, 64), np.uint8)
-        mask[rng.integers(48, size=few), rng.integers(64, size=few)] = 255
-        mask[0, 0] = 255 * (few == 2)
-        joined = cv2.dilate(mask, np.ones(bridge[::-1], np.uint8))
-        stats = cv2.connectedComponentsWithStats(joined)[2]
-        assert sorted(map(tuple, pieces(mask, bridge))) == sorted(map(tuple, stats[1:, :4].tolist()))
-
-
 def test_swaying_twigs_are_background():
     """Dark twigs on a bright sky swing by 2 px; after they have been seen for a while nothing is detected."""
     rng = np.random.default_rng(5)
@@ -351,7 +338,9 @@ def test_who_walks_is_seen_again_soon_after_the_whole_picture_has_changed(what):
 
 
 def test_the_kind_of_detector_follows_the_target(tmp_path):
-    assert isinstance(motion("bird"), BackgroundDetector)
+    for name in ("motion", "mog2"):
+        detector = make_detector(dataclasses.replace(DEFAULT_TARGETS["bird"], detector=name), RATE)
+        assert isinstance(detector, BackgroundDetector)
     assert isinstance(make_detector(DEFAULT_TARGETS["bird"], RATE), SmallTargetDetector)
     cv2.imwrite(str(tmp_path / "cover.png"), cover())
     red = TargetProfile(0.2, "width", 160.0, "colour", template=tmp_path / "cover.png")

@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import BackgroundDetector, SmallTargetDetector, make_detector
-from cotarget.detection.small_target import (
-    CLEAR_SIGNAL,
-    CameraMotion,
-    History,
-    changes,
-    find_small_targets,
-    small_target_score,
-)
+from cotarget.detection import SmallTargetDetector
+from cotarget.detection.small_target import CameraMotion, find_small_targets
 from cotarget.errors import CotargetError
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
@@ -197,12 +190,12 @@ def test_a_bird_in_front_of_rough_ground_is_found_at_a_hundred_frames_a_second()
     rng, rate = np.random.default_rng(8), 100.0
     ground, detector, on = landscape(rng), SmallTargetDetector(), []
     tracker = Tracker(tracking_settings(SPECK), (WIDTH, HEIGHT))
-    for i in range(240):
+    for i in range(180):
         picture, at = ground.copy(), (30 + 40 * i / rate, 205)
         draw(picture, *at, 10, 7, grey=40.0)
         tracks = tracker.update(detector.detect(Frame(photograph(picture, rng), i / rate)).boxes, i / rate)
         on.append(any(np.linalg.norm(t.center_px - at) < 5 for t in tracks if t.confirmed))
-    assert np.mean(on[120:]) > 0.9
+    assert np.mean(on[100:]) > 0.9
 
 
 @pytest.mark.parametrize("times", [1, 2, 3])
@@ -231,8 +224,7 @@ def test_a_bird_of_a_pixel_is_found_in_a_small_picture(times):
     assert np.median(off) < 0.2
 
 
-@pytest.mark.parametrize(("width", "height"), [(240, 180), (320, 240)])
-@pytest.mark.parametrize("noise", [2.0, 4.0, 8.0])
+@pytest.mark.parametrize(("width", "height", "noise"), [(240, 180, 2.0), (240, 180, 8.0), (320, 240, 4.0)])
 def test_noise_alone_makes_no_track(width, height, noise):
     """Small pictures are enlarged before they are searched, and their noise with them."""
     rng = np.random.default_rng(1)
@@ -245,22 +237,12 @@ def test_noise_alone_makes_no_track(width, height, noise):
 def test_a_twig_that_sways_where_it_is_makes_no_track():
     """Above the ground's rough edge, to and fro by its own size in the wind."""
     rng = np.random.default_rng(7)
-    way = 3 * np.cumsum(rng.normal(0, 0.5, 200)) % 8 - 4
+    way = 3 * np.cumsum(rng.normal(0, 0.5, 120)) % 8 - 4
 
     def paint(picture, i):
         draw(picture, 160 + way[i], 168, 6, 4)
 
-    assert sum(len(confirmed) for confirmed in follow(film(200, paint))) < 0.1 * 200
-
-
-def test_poles_wires_and_edges_are_no_specks():
-    rng = np.random.default_rng(1)
-    picture = landscape(rng)
-    picture[:, 100:103] = 60  # a pole
-    picture[50:52] = 60  # a wire
-    picture[:60, 200:] += 25  # a cloud's edge
-    grey = cv2.cvtColor(photograph(picture, rng), cv2.COLOR_BGR2GRAY)
-    assert [target for target in find_small_targets(grey, 5.0, 40) if target.low[1] < 150] == []
+    assert sum(len(confirmed) for confirmed in follow(film(120, paint))) < 0.1 * 120
 
 
 def test_a_camera_that_shakes_makes_nothing_move():
@@ -384,53 +366,6 @@ def test_after_a_cut_what_stands_is_no_target_and_what_flies_is_one_soon():
     assert all(found[40:])  # 0.4 s after the cut
 
 
-def test_change_is_a_part_of_the_targets_own_contrast():
-    """By hand: a dark square that is gone has changed wholly, one that stands not at all, whatever the contrast."""
-    for grey in (40, 140):
-        before = np.full((60, 80), 160, np.uint8)
-        after = before.copy()
-        after[20:26, 30:36] = grey
-        low, size, still = (30, 20), (6, 6), np.zeros(2)
-        assert changes(after, low, size, 160.0, still, 0.0, [(before, still)]) == pytest.approx([1.0])
-        assert changes(after, low, size, 160.0, still, 0.0, [(after, still)]) == [0.0]
-        shifted = np.roll(after, 5, axis=1)
-        assert changes(shifted, (35, 20), size, 160.0, np.array([5.0, 0.0]), 0.0, [(after, still)]) == [0.0]
-    assert changes(after, low, size, 160.0, np.array([60.0, 0.0]), 0.0, [(before, still)]) == [0.0]  # was not in view
-
-
-def test_a_shift_between_two_pixels_is_no_change():
-    """A blurred pole, a third of a pixel beside where the camera's shift would have it."""
-    u = np.arange(80.0)
-
-    def pole(at):
-        return np.tile(160 - 100 * np.exp(-(((u - at) / 2) ** 2)), (60, 1)).round().astype(np.uint8)
-
-    still = np.zeros(2)
-    change = changes(pole(40.3), (36, 20), (9, 20), 160.0, still, 0.0, [(pole(40.0), still)])
-    assert change == pytest.approx([0.0], abs=0.01)
-
-
-def test_the_pictures_noise_is_measured():
-    rng = np.random.default_rng(10)
-    history = History()
-    for i in range(3):
-        history.add(i / RATE, np.clip(rng.normal(128, 4.0, (240, 320)), 0, 255).astype(np.uint8), np.zeros(2))
-    assert history.noise == pytest.approx(4.0, rel=0.3)
-
-
-def test_score_rises_with_contrast_and_change_and_neither_alone_will_do():
-    """A clear contrast does not make up for a lack of change, and texture beside a target speaks against it."""
-    usual, sky, trees = [0.05, 0.08, 0.15, 0.20], 0.0, 20.0
-    assert small_target_score(6.0, [0.9] * 4, sky) > small_target_score(6.0, [0.9] * 4, trees) > 0.8
-    assert small_target_score(100.0, [0.0] * 4, sky) < 0.5
-    assert small_target_score(100.0, [0.0] * 4, trees) < 0.01
-    assert small_target_score(100.0, usual, sky) == small_target_score(CLEAR_SIGNAL, usual, sky)
-    appeared = [0.0, 0.0, 1.0, 1.0]  # what has come and stands
-    goes_on = [0.1, 0.3, 1.0, 1.0]
-    assert small_target_score(CLEAR_SIGNAL, appeared, trees) < 0.5 < small_target_score(CLEAR_SIGNAL, goes_on, trees)
-    assert small_target_score(CLEAR_SIGNAL, [float("nan")] * 4, sky) == 0.0
-
-
 def test_frames_that_repeat_and_times_that_jump():
     """The same picture again tells nothing; a clock that jumps makes the detector learn anew; neither ends it."""
 
@@ -459,28 +394,3 @@ def test_pictures_too_small_dark_or_bright_are_no_error():
             for i, picture in enumerate(pictures):
                 picture[0, i % 8] ^= 1  # differs from the last one, so that it is searched
             assert watch(pictures) == [[]] * 40
-
-
-def test_a_hundred_moving_things_keep_their_numbers():
-    rng = np.random.default_rng(11)
-    start = np.stack(np.meshgrid(np.linspace(20, 280, 10), np.linspace(20, 200, 10)), axis=-1).reshape(-1, 2)
-    tracker = Tracker(tracking_settings(dataclasses.replace(SPECK, detector="mog2")))
-
-    @dataclasses.dataclass
-    class Seen:
-        center_px: np.ndarray
-        size_px: np.ndarray
-        score: float = 1.0
-        clipped: bool = False
-
-    for i in range(30):
-        places = start + i * np.array([1.0, 0.3]) + rng.normal(0, 0.2, start.shape)
-        tracks = tracker.update([Seen(p, np.array([5.0, 4.0])) for p in places], i / RATE)
-    assert [t.id for t in tracks] == list(range(1, 101))
-    assert all(t.confirmed for t in tracks)
-
-
-def test_names_of_detectors():
-    assert isinstance(make_detector(SPECK, RATE), SmallTargetDetector)
-    for name in ("motion", "mog2"):
-        assert isinstance(make_detector(dataclasses.replace(SPECK, detector=name), RATE), BackgroundDetector)
