@@ -58,22 +58,18 @@ def test_captures_may_be_in_any_order_beside_unlisted_images(folder):
 
 
 @pytest.mark.parametrize(("rows", "changes", "said"), [
-    ([], {}, "captures: "),
-    ([FIXED], {"schema": 2}, "schema 2"),
+    ([], {}, "captures: "), ([FIXED], {"schema": 2}, "schema 2"),
     ([FIXED], {"board": BOARD | {"kind": "circles"}}, "board.kind"),
     ([FIXED], {"board": {"kind": "chessboard", "corners": [9, 6]}}, "board.square: Field required"),
     ([FIXED, ZOOM | {"file": "c.png"}], {}, "captures[1].file: c.png"),
     ([FIXED, ZOOM, FIXED], {}, "captures[2].file: a.png"),
     ([FIXED, FIXED | {"file": "./a.png"}], {}, "captures[1].file: a.png"),
     ([FIXED | {"file": "../a.png"}], {}, "captures[0].file"),
-    ([FIXED | {"camera": "wide"}], {}, "captures[0].camera"),
-    ([FIXED | {"board": -1}], {}, "captures[0].board"),
+    ([FIXED | {"camera": "wide"}], {}, "captures[0].camera"), ([FIXED | {"board": -1}], {}, "captures[0].board"),
     ([FIXED, ZOOM | {"pan": None}], {}, "captures[1].pan"),
     ([{k: v for k, v in ZOOM.items() if k != "tilt"}], {}, "captures[0].tilt"),
-    ([ZOOM | {"tilt": "up"}], {}, "captures[0].tilt"),
-    ([ZOOM | {"pan": 90.0}], {}, "captures[0].pan: 90"),
-    ([FIXED], {}, "zoom camera"),
-    ([FIXED | {"file": "text.png"}, ZOOM], {}, "text.png"),
+    ([ZOOM | {"tilt": "up"}], {}, "captures[0].tilt"), ([ZOOM | {"pan": 90.0}], {}, "captures[0].pan: 90"),
+    ([FIXED], {}, "zoom camera"), ([FIXED | {"file": "text.png"}, ZOOM], {}, "text.png"),
     ([FIXED, FIXED | {"file": "small.png"}, ZOOM], {}, "small.png: is 32x24 px"),
 ])  # fmt: skip
 def test_malformed_index_is_refused_with_its_key(folder, rows, changes, said):

@@ -106,10 +106,7 @@ def still_with_board(outline_px):
 
 @pytest.mark.parametrize(
     "outline_px",
-    [
-        ((900, 500), (2700, 650), (2650, 1900), (950, 2000)),
-        ((2900, 2300), (1100, 2200), (1000, 900), (2800, 1000)),
-    ],
+    [((900, 500), (2700, 650), (2650, 1900), (950, 2000)), ((2900, 2300), (1100, 2200), (1000, 900), (2800, 1000))],
 )
 def test_board_in_a_large_still_is_found_beside_clutter(outline_px):
     still, truth = still_with_board(outline_px)
@@ -129,7 +126,7 @@ def test_a_board_too_small_for_the_reduced_still_is_found_at_full_size():
 
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 4])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 6])
 def test_boards_in_real_photos_are_found_and_no_others(every):
     """Its outer squares are cut short, and a screen behind it shows two small boards in some."""
     guesses = []

@@ -1,6 +1,5 @@
 """Hand-eye: exact and noisy motions of heads and arms, consistent covariances, and motions that must be refused."""
 
-import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -35,15 +34,9 @@ def test_exact_motions_give_t_exactly(angles, dz):
         assert np.linalg.norm(error.translation) < EXACT
 
 
-def test_hand_eye_refuses_matrices():
-    with pytest.raises(CalibrationError, match="RigidTransform"):
-        solve_hand_eye([np.eye(4)] * 3, [np.eye(4)] * 3)
-
-
 @pytest.mark.parametrize(("angles", "message"), [
     ([(0.0, 0.1), (0.2, 0.1), (-0.3, 0.1)], "only pan moved"),
-    ([(0.1, 0.0), (0.1, 0.2), (0.1, -0.3)], "only tilt moved"),
-    ([(0.1, 0.1), (0.1, 0.1)], "did not move"),
+    ([(0.1, 0.0), (0.1, 0.2), (0.1, -0.3)], "only tilt moved"), ([(0.1, 0.1), (0.1, 0.1)], "did not move"),
 ])  # fmt: skip
 def test_park_martin_refuses_motions_about_one_axis(angles, message):
     with pytest.raises(CalibrationError, match=message):
@@ -137,14 +130,9 @@ def from_motions(starts, ends):
 
 
 @pytest.mark.slow
-def test_covariance_from_poses_is_consistent():
+def test_covariances_are_consistent():
     rng = np.random.default_rng(0)
     check_honest(from_poses(arm(rng, 20)), from_poses(pan_tilt(rng, 20)))
-
-
-@pytest.mark.slow
-def test_covariance_from_motions_is_consistent():
-    rng = np.random.default_rng(1)
     check_honest(from_motions(arm(rng, 20), arm(rng, 20)), from_motions(pan_tilt(rng, 20), pan_tilt(rng, 20)))
 
 
@@ -162,29 +150,8 @@ def test_covariance_from_few_poses_counts_the_degrees_of_freedom():
     assert FEW_POSES_RATIO[0] < np.mean(measured / predicted) < FEW_POSES_RATIO[1]
 
 
-@pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="OpenCV 5 has no calibrateHandEye")
-def test_hand_eye_is_no_worse_than_opencv():
-    rng = np.random.default_rng(1)
-    hands = arm(rng, 20)
-    seen = boards_seen(hands)
-    ours, theirs = [], []
-    for _ in range(20):
-        poses = [noisy(T, rng) for T in seen]
-        R, t = cv2.calibrateHandEye(
-            [T.rotation.as_matrix() for T in hands], [T.translation for T in hands],
-            [T.rotation.as_matrix() for T in poses], [T.translation for T in poses],
-            method=cv2.CALIB_HAND_EYE_PARK,
-        )  # fmt: skip
-        theirs.append(error_of(RigidTransform.from_components(t.ravel(), Rotation.from_matrix(R))))
-        ours.append(error_of(solve_hand_eye(hands, poses).X))
-    for part in (slice(3), slice(3, 6)):
-        assert np.mean(np.square(ours)[:, part]) <= np.mean(np.square(theirs)[:, part])
-
-
 @pytest.mark.parametrize("hands", [
-    head([(0, 0), (10, 0), (0, 10)]),
-    arm(np.random.default_rng(2), 3),
-    arm(np.random.default_rng(2), 30),
+    head([(0, 0), (10, 0), (0, 10)]), arm(np.random.default_rng(2), 3), arm(np.random.default_rng(2), 30),
 ])  # fmt: skip
 def test_exact_poses_give_x_and_the_board(hands):
     found = solve_hand_eye(hands, boards_seen(hands))
@@ -322,13 +289,9 @@ def test_noise_of_the_hand_does_not_pass_for_a_second_axis():
             solve_hand_eye(hands, [noisy(T, rng, 1e-3, 1e-3) for T in boards_seen(PLANAR)])
 
 
-def test_pan_at_another_tilt_is_named_pan():
-    hands = head([(-15, 20), (-5, 20), (0, 20), (10, 20)])
-    with pytest.raises(CalibrationError, match="only pan moved"):
-        solve_hand_eye(hands, boards_seen(hands))
-
-
-def test_hand_eye_refuses_too_few_views():
+def test_hand_eye_refuses_too_few_views_and_matrices():
+    with pytest.raises(CalibrationError, match="RigidTransform"):
+        solve_hand_eye([np.eye(4)] * 3, [np.eye(4)] * 3)
     with pytest.raises(CalibrationError, match="1 and 1 motions"):
         solve_hand_eye_from_motions([X], [X])
     with pytest.raises(CalibrationError, match="three views"):

@@ -132,8 +132,7 @@ def test_head_that_moves_too_little_is_named(angles, begins, free):
 @pytest.mark.parametrize(("name", "free", "add"), [
     ("T_zoom0_fixed.tz", "T_zoom0_fixed's position", "near and far"),
     ("zoom[2].pupil", "the zoom camera's stop 2's pupil's shift", "near and far at that focal length"),
-    ("zoom.k1", "the zoom camera's distortion", "corners"),
-    ("head.pan_scale", "the head's scale of pan", "add pan"),
+    ("zoom.k1", "the zoom camera's distortion", "corners"), ("head.pan_scale", "the head's scale of pan", "add pan"),
     ("T_head_zoom.tz", "T_head_zoom's position", "nearer"),
 ])  # fmt: skip
 def test_single_undetermined_parameter_is_named_with_advice(name, free, add):
@@ -141,13 +140,6 @@ def test_single_undetermined_parameter_is_named_with_advice(name, free, add):
     text = name_directions(names, weak_directions(np.diag([1.0, 0.0]), names, 0.0))
     assert text.startswith(f"{free} is free; ")
     assert add in text
-
-
-@pytest.mark.parametrize(("sigma", "weak"), [(4.9, 0), (5.1, 1)])
-def test_limit_of_use_of_a_rotation_is_five_degrees(sigma, weak):
-    names = ["T_zoom0_fixed.ry"]
-    normal = np.array([[1.0]]) / np.radians(sigma) ** 2
-    assert len(weak_directions(normal, names, 1.0)) == weak
 
 
 def test_no_direction_has_no_name_and_unknown_parameters_are_refused():

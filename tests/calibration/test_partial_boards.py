@@ -71,11 +71,8 @@ def inside(pixels, margin):
 
 
 @pytest.mark.parametrize("how", [
-    {},
-    {"offset": (4.0, -3.0), "scale": 1.01},
-    {"offset": (-10.0, 11.0), "scale": 0.97, "turn_deg": 1.0},
-    {"offset": (12.0, 5.0), "scale": 1.03, "turn_deg": -2.0},
-    {"offset": (3.0, 3.0), "bend_px": 4.0},
+    {}, {"offset": (4.0, -3.0), "scale": 1.01}, {"offset": (-10.0, 11.0), "scale": 0.97, "turn_deg": 1.0},
+    {"offset": (12.0, 5.0), "scale": 1.03, "turn_deg": -2.0}, {"offset": (3.0, 3.0), "bend_px": 4.0},
 ], ids=["true", "usual", "far", "turned", "bent"])  # fmt: skip
 def test_corners_in_view_are_found_and_numbered(views, how):
     errors = []
@@ -130,8 +127,7 @@ def test_a_prediction_two_squares_off_is_refused_where_an_edge_across_is_in_view
 
 
 @pytest.mark.parametrize("spoil", [
-    lambda image: cv2.GaussianBlur(image, (0, 0), 14),
-    lambda image: cv2.blur(image, (50, 1)),
+    lambda image: cv2.GaussianBlur(image, (0, 0), 14), lambda image: cv2.blur(image, (50, 1)),
     lambda image: np.where(np.arange(640)[:, None] < 320, image, np.uint8(90)),
     lambda image: np.random.default_rng(0).integers(0, 255, image.shape, dtype=np.uint8),
     lambda image: np.full_like(image, 128),

@@ -7,45 +7,31 @@ import pytest
 
 from cotarget.backends import describe
 from cotarget.board import board_points
-from cotarget.calibration import Calibration
 from cotarget.calibration.plausibility import check_plausible
-from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.camera import ZoomLens
 from cotarget.config import BoardConfig, RigConfig, SimConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
 from cotarget.pantilt import HeadGeometry
-from cotarget.rig_geometry import FixedCamera, ZoomHead
-from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth, other_rig
+from cotarget.rig_geometry import FixedCamera
+from experiments.calibration.synthetic.rig import NOMINAL_PX, Truth, other_rig
 from experiments.calibration.synthetic.views import synthetic_views
+from tests.support.moving_targets import calibration_of
 from tests.support.rigs import with_zoom_head
 
 SPEC = describe(RigConfig(sim=SimConfig()))
 NOISE_PX = 0.1
 
 
-def calibration_of(truth, *, with_views=True):
+def exact_calibration(truth, *, with_views=True):
     """The exact calibration of a synthetic rig, with corners that it was made from."""
-
-    def intrinsics(lens):
-        return Intrinsics(SIZE, (lens.fx, lens.fy), (lens.cx, lens.cy), lens.distortion)
-
     board = BoardConfig()
     views = synthetic_views(truth, board_points(board), np.random.default_rng(1), boards=6, noise_px=NOISE_PX)
-    return Calibration(
-        fixed=FixedCamera(intrinsics(truth.fixed)),
-        zoom_head=ZoomHead(
-            ZoomLens((NOMINAL_PX,), (intrinsics(truth.zoom),)),
-            truth.gamma,
-            truth.hand,
-            HeadGeometry(truth.dz, truth.eps),
-        ),
-        board=board,
-        views=tuple(views) if with_views else (),
-    )
+    return calibration_of(truth, board=board, views=tuple(views) if with_views else ())
 
 
-GOOD = calibration_of(Truth())
-PLAIN = calibration_of(Truth(), with_views=False)
+GOOD = exact_calibration(Truth())
+PLAIN = exact_calibration(Truth(), with_views=False)
 
 
 def in_mm(T):
@@ -103,28 +89,21 @@ def test_implausible_calibration_is_refused_unless_insisted_on(name):
 
 @pytest.mark.parametrize("with_views", [True, False])
 @pytest.mark.parametrize("truth", [Truth(), other_rig()])
-def test_unusual_rigs_are_plausible(truth, with_views):
-    check_plausible(calibration_of(truth, with_views=with_views))
-
-
-def test_calibration_for_smaller_streams_is_plausible():
-    check_plausible(GOOD.for_streams((320, 240), (320, 240)))
+def test_unusual_rigs_and_smaller_streams_are_plausible(truth, with_views):
+    calibration = exact_calibration(truth, with_views=with_views)
+    check_plausible(calibration)
+    check_plausible(calibration.for_streams((320, 240), (320, 240)))
 
 
 def test_calibration_of_another_lens_is_refused():
     own = list(SPEC.zoom.focal_range)
     check_plausible(replace(GOOD, provenance={"focal_range_px": own}), SPEC)
     check_plausible(GOOD, SPEC)  # captures of another program do not say what the lens can do
+    stills = GOOD.for_streams(GOOD.fixed.size, (1280, 960))  # of the same lens, in pixels half as large
+    check_plausible(replace(stills, provenance={"focal_range_px": [2 * focal for focal in own]}), SPEC)
     for focal_range in ([own[0] / 2, own[1]], [own[0], own[1] / 2]):
         with pytest.raises(CalibrationError, match=r"^calibration: is of a lens .* another rig's"):
             check_plausible(replace(GOOD, provenance={"focal_range_px": focal_range}), SPEC)
     farther = with_zoom_head(GOOD, lens=ZoomLens((2 * own[1],), GOOD.zoom_head.lens.stops))
     with pytest.raises(CalibrationError, match="another rig's"):
         check_plausible(farther, SPEC)
-
-
-def test_a_calibration_of_stills_fits_the_stream_of_the_same_lens():
-    # Focal lengths of a still twice as large as the stream are twice as long.
-    twice = [2 * focal for focal in SPEC.zoom.focal_range]
-    large = GOOD.for_streams(GOOD.fixed.size, (1280, 960))
-    check_plausible(replace(large, provenance={"focal_range_px": twice}), SPEC)

@@ -4,13 +4,14 @@ import contextlib
 import io
 import itertools
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cotarget import __version__
+from cotarget.board import draw_board
 from cotarget.calibration.calibrate import calibrate
 from cotarget.calibration.captures import INDEX, read_index
 from cotarget.calibration.planning import GRID, Coverage, plan_poses
@@ -20,10 +21,10 @@ from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig, parse_config
 from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import pose
+from cotarget.rig import Frame, PanTiltLimits
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
-from tests.support.rigs import alike
-from tests.support.synthetic_rig import SyntheticRig
+from tests.support.synthetic_rig import PERIOD, SyntheticRig
 
 BOARD = BoardConfig()
 
@@ -255,13 +256,6 @@ def test_an_image_counts_some_time_after_the_head_stands(real_time, settle):
     assert made.seen[0]["newer_than"] == pytest.approx(made.rig.arrives + settle)
 
 
-def test_a_board_is_expected_to_be_hidden_only_behind_one_that_was_missed():
-    coverage = Coverage(SIZE, misses=[(np.array([320.0, 240.0]), 3.0)])
-    places = np.array([[330.0, 240.0], [500.0, 240.0]])
-    assert coverage.hidden(places, 3.0).tolist() == [True, False]
-    assert coverage.hidden(places, 2.0).tolist() == [False, False]
-
-
 class Interrupted:
     """A rig whose user presses Ctrl-C at its n-th frame, and whose board's holder is gone by then."""
 
@@ -315,3 +309,79 @@ def test_calibration_shows_one_line_of_progress_on_a_terminal(terminal, given, m
     assert bool(seen) == given
     assert ("0 % looking for the board with the fixed camera" in shown) == (terminal and not given)
     assert not shown or (shown.endswith("\r\x1b[K") and "\n" not in shown)
+
+
+@dataclass
+class SlowHands:
+    """Moves the board from the old pose to the requested one within three seconds, as people do."""
+
+    rig: SyntheticRig
+    patience: float = 20.0
+
+    def present(self, T_fixed_board):
+        rig = self.rig
+        old = rig.placed[-1][1]
+        start = T_fixed_board if old is None else old
+        for k in range(1, 61):
+            s = k / 60
+            between = (1 - s) * start.translation + s * T_fixed_board.translation
+            turned = start.rotation * (start.rotation.inv() * T_fixed_board.rotation) ** s
+            rig.placed.append((rig.t + 3 * s, pose(between, turned.as_rotvec(degrees=True))))
+
+
+def started(rig):
+    recorder = CaptureRecorder(rig, rig.board_config)
+    recorder.start()
+    return recorder
+
+
+def test_session_waits_until_a_held_board_is_still():
+    rig = SyntheticRig()
+    rig.board = SlowHands(rig)
+    rig.placed.append((0.0, pose([-0.4, -0.25, 3.0], [0, 0, 0])))
+    recorder, begun = started(rig), rig.t
+    recorder.present(pose([-0.1, -0.1, 3.0], [0, 20, 0]))
+    assert 3.0 < rig.t - begun < 6.0
+    assert recorder.see_fixed() is not None
+
+
+def test_session_stops_waiting_for_a_board_after_its_patience():
+    rig = SyntheticRig()
+    rig.board = replace(rig.board, patience=5.0)
+    recorder, begun = started(rig), rig.t
+    recorder.present(pose([0, 0, -3.0], [0, 0, 0]))
+    assert 5.0 <= rig.t - begun < 7.0
+
+
+def test_shaking_hands_count_as_still_whatever_the_image_size():
+    """A board in an image of 2560 px that moves to and fro by 0.25 px of 640."""
+    rig = SyntheticRig()
+    rig.board = replace(rig.board, patience=20.0)
+    rig.fixed.size = (2560, 1920)
+    board = draw_board(rig.board_config, 160)
+
+    def read(newer_than, timeout):
+        rig.t = max(rig.t, newer_than) + PERIOD
+        rig.frames += 1
+        return Frame(np.roll(board, rig.frames % 2 + 60 * (len(rig.placed) - 1), axis=1), rig.t)
+
+    rig.fixed.read = read
+    recorder, begun = started(rig), rig.t
+    recorder.present(pose([0, 0, 2.0], [0, 0, 0]))
+    assert rig.t - begun < 2.0
+
+
+def test_a_charuco_board_seen_in_part_counts_as_still():
+    board = BoardConfig("charuco", (8, 6), 0.1)
+    rig = SyntheticRig(board_config=board)
+    rig.board = replace(rig.board, patience=20.0)
+    before, after = (draw_board(board, 40)[:, left:] for left in (150, 170))  # without two columns of corners
+
+    def read(newer_than, timeout):
+        rig.t = max(rig.t, newer_than) + PERIOD
+        return Frame(before if len(rig.placed) == 1 else after, rig.t)
+
+    rig.fixed.read = read
+    recorder, begun = started(rig), rig.t
+    recorder.present(pose([0, 0, 2.0], [0, 0, 0]))
+    assert rig.t - begun < 2.0

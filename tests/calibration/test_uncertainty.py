@@ -1,4 +1,4 @@
-"""Covariance of a calibration, worked by hand for the line of sight; the experiment `honesty` says how true it is."""
+"""Covariance of a calibration, by hand and against refits; the experiment `honesty` says how true it is."""
 
 from dataclasses import replace
 
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from cotarget.calibration import Calibration, Covariance, line_of_sight_covariance, predicted_pointing
-from cotarget.calibration.bundle import ALL_BLOCKS, Fit, coordinate_variance, parameter_names
+from cotarget.calibration.bundle import ALL_BLOCKS, Fit, coordinate_variance, difference, fit, parameter_names
 from cotarget.calibration.initialization import at_home
 from cotarget.calibration.model import BundleModel
-from cotarget.calibration.uncertainty import covariance_of
+from cotarget.calibration.uncertainty import covariance_of, model_of, with_consider_covariance
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
@@ -19,7 +19,7 @@ from experiments.calibration.honesty import error_of
 from experiments.calibration.synthetic.rig import SIZE, Truth
 from experiments.calibration.synthetic.views import synthetic_views
 from tests.support.rigs import with_zoom_head
-from tests.support.synthetic_calibration import POINTS, calibrated
+from tests.support.synthetic_calibration import POINTS, calibrated, drawn, fitted, pointing
 
 SIGMA_PX = 0.1
 
@@ -165,3 +165,50 @@ def test_the_variance_of_a_coordinate():
     by_hand = (0.6 + 0.4 * scale**2) / 2 / (0.6 + 0.4 / 4) ** 2
     assert coordinate_variance(residuals, 0) == pytest.approx(by_hand, rel=1e-9)
     assert coordinate_variance(residuals, residuals.size // 2) == pytest.approx(2 * by_hand, rel=1e-9)
+
+
+SCALES = Truth(pan_scale=1.002, tilt_scale=0.998)
+# A tenth of the scales' error, for a difference of two fits that is linear to a thousandth.
+ELSEWHERE = 0.0002
+
+
+@pytest.fixture(scope="module")
+def scaled():
+    return calibrated(drawn(SCALES))
+
+
+@pytest.fixture(scope="module")
+def found(scaled):
+    return fitted(model_of(scaled), scaled.views)
+
+
+@pytest.mark.parametrize("name", ["pan_scale", "tilt_scale"])
+def test_sensitivity_to_a_held_scale_is_that_of_refits(found, name):
+    covariance = with_consider_covariance(covariance_of(found), found, POINTS, ["scale"])
+    i = covariance.parameters.index(f"head.{name}")
+    own = len(parameter_names(ALL_BLOCKS))
+    by_held = covariance.matrix[:own, i] / covariance.matrix[i, i]
+    axes = replace(found.model.zoom_head.axes, **{name: 1 + ELSEWHERE})
+    moved = fit(found.model.with_zoom_head(axes=axes), found.views, POINTS, ALL_BLOCKS).model
+    sigmas = np.sqrt(np.diagonal(covariance_of(found).matrix))
+    expected = difference(moved, found.model, ALL_BLOCKS) / ELSEWHERE
+    np.testing.assert_allclose(by_held / sigmas, expected / sigmas, atol=0.01 * np.abs(expected / sigmas).max())
+
+
+def test_consider_covariance_only_grows(found):
+    covariance = covariance_of(found)
+    grown = with_consider_covariance(covariance, found, POINTS, ["scale"])
+    own = len(covariance.parameters)
+    added = grown.matrix[:own, :own] - covariance.matrix
+    assert grown.parameters[:own] == covariance.parameters
+    assert np.linalg.eigvalsh(added)[0] > -1e-9 * np.linalg.eigvalsh(added)[-1]
+    assert with_consider_covariance(covariance, found, POINTS, []) is covariance
+
+
+def test_wrong_scales_widen_the_covariance_by_their_error(scaled):
+    """To within what the corners know of the scales, some three ten-thousandths."""
+    assert scaled.covariance.sigma("head.pan_scale") == pytest.approx(0.002, abs=0.0012)
+    assert scaled.covariance.sigma("head.tilt_scale") == pytest.approx(0.002, abs=0.0012)
+    assert scaled.zoom_head.axes.pan_scale == 1.0
+    measured, predicted = pointing(scaled, SCALES)
+    assert measured < 2 * predicted

@@ -1,4 +1,6 @@
-"""A ChArUco board: one pattern for paper and simulation, numbered like OpenCV's own, and found when seen in part."""
+"""Boards: a ChArUco is numbered as by OpenCV and found when seen in part; a printed board has its size on paper."""
+
+import re
 
 import cv2
 import numpy as np
@@ -11,10 +13,11 @@ from cotarget.board import (
     cells,
     draw_board,
     marker_dictionary,
-    tiles,
+    print_board,
 )
 from cotarget.calibration.corners import find_corners, find_near
 from cotarget.config import BoardConfig, parse_config
+from cotarget.errors import ConfigError
 from cotarget.geometry import pose
 from cotarget.sim.world import SimWorld
 
@@ -43,20 +46,6 @@ def test_the_pattern_is_opencvs_own(corners):
     assert np.allclose(opencv_board(board).getChessboardCorners() - board_points(board), [board.square] * 2 + [0])
 
 
-@pytest.mark.parametrize("kind", ["chessboard", "charuco"])
-def test_tiles_cover_the_board_once(kind):
-    board = BoardConfig(kind, (4, 3))
-    dark = cells(board)
-    n = dark.shape[0] // 4
-    count, painted = np.zeros(dark.shape, int), np.zeros(dark.shape, bool)
-    for tile in tiles(board):
-        x0, y0, x1, y1 = (round(n * edge) for edge in (tile.x0, tile.y0, tile.x1, tile.y1))
-        count[y0:y1, x0:x1] += 1
-        painted[y0:y1, x0:x1] = tile.dark
-    assert (count == 1).all()
-    np.testing.assert_array_equal(painted, dark)
-
-
 @pytest.mark.parametrize("square_px", [40, 33])
 def test_the_drawn_board_is_found_and_numbered_as_opencv_does(square_px):
     image = draw_board(BOARD, square_px)
@@ -80,9 +69,7 @@ def test_charuco_is_found_in_part():
 
 
 @pytest.mark.parametrize("image", [
-    np.full((480, 640), 128, np.uint8),
-    draw_board(BoardConfig(), 30),
-    draw_board(BOARD, 40)[:140],
+    np.full((480, 640), 128, np.uint8), draw_board(BoardConfig(), 30), draw_board(BOARD, 40)[:140],
     np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8),
 ], ids=["nothing", "a plain chessboard", "one row", "noise"])  # fmt: skip
 def test_charuco_needs_more_than_one_row(image):
@@ -113,3 +100,38 @@ def test_charuco_corners_in_rendered_images_are_accurate():
     error = np.concatenate(errors)
     assert np.sqrt(np.mean(error**2)) < RMS_PX
     assert np.abs(error).max() < WORST_PX
+
+
+PRINTED = BoardConfig(corners=(7, 4), square=0.02)
+PIXELS_PER_SQUARE = 0.02 / 0.0254 * 300
+CORNER_PX = 0.2  # 0.02 mm on paper: edges within a pixel are drawn in few levels, and the finder errs too
+
+
+def test_pdf_of_a_board_has_its_true_size(tmp_path):
+    """8 x 5 squares of 20 mm with a square of border: 200 x 140 mm, in points of 1/72 inch."""
+    assert print_board(tmp_path / "board.pdf", PRINTED) == pytest.approx((0.2, 0.14))
+    box = re.search(rb"/MediaBox \[ *([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+)", (tmp_path / "board.pdf").read_bytes())
+    points = [float(v) for v in box.groups()]
+    assert points == pytest.approx([0, 0, 200 / 25.4 * 72, 140 / 25.4 * 72], abs=0.01)
+
+
+@pytest.mark.parametrize("board", [PRINTED, BoardConfig("charuco", (6, 4), 0.02)], ids=lambda board: board.kind)
+def test_png_of_a_board_is_found_at_its_true_size(tmp_path, board):
+    print_board(tmp_path / "board.png", board)
+    corners = find_corners(cv2.imread(str(tmp_path / "board.png")), board)
+    expected = board_points(board)[:, :2] / board.square * PIXELS_PER_SQUARE
+    # Where the page begins is cut to whole pixels; how far the corners are apart is not.
+    np.testing.assert_allclose(corners - corners[0], expected, atol=CORNER_PX)
+    np.testing.assert_allclose(corners[0], 2 * PIXELS_PER_SQUARE - 0.5, atol=1.0)
+    assert [p.name for p in tmp_path.iterdir()] == ["board.png"]
+
+
+@pytest.mark.parametrize(("name", "board", "said"), [
+    ("board.doc", PRINTED, "board.doc"),
+    ("board.pdf", BoardConfig(corners=(6, 6)), "board.corners"),
+    ("board.pdf", BoardConfig(corners=(9, 6), square=25.0), "metres"),
+])  # fmt: skip
+def test_print_board_refuses_unknown_formats_and_impossible_boards(tmp_path, name, board, said):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        print_board(tmp_path / name, board)
+    assert not list(tmp_path.iterdir())
