@@ -1,10 +1,13 @@
-"""Results of the commands: JSON on stdout, tables, films and calibrations."""
+"""Results of the commands: JSON on stdout, tables, films and calibrations, and the lines of `config`."""
 
 import json
 import math
 import os
+import re
 import subprocess
 import sys
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,10 +16,13 @@ import pytest
 
 import cotarget
 from cotarget.calibration import Options
-from cotarget.config import BoardConfig, RigConfig
+from cotarget.cli.main import main
+from cotarget.config import BoardConfig, HardwareConfig, RigConfig, parse_config
+from cotarget.drivers.rig import devices
 from cotarget.errors import CalibrationError
 from cotarget.geometry import pose
 from experiments.calibration.synthetic.rig import Truth, undistorted
+from experiments.engine import LINEAR_ALGEBRA
 from tests.support.commands import OLD, bird_film, call, refused, true_calibration, write_index
 from tests.support.synthetic_rig import draw, pixel_rays
 
@@ -125,10 +131,8 @@ def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, ca
 
 
 @pytest.mark.parametrize(("more", "wanted_px"), [
-    (["--target", "book"], 160),
-    (["--target", "book", "--wanted-px", "100"], 100),
-    (["--target", "book", "--focal-mm", "20"], None),
-    ([], None),
+    (["--target", "book"], 160), (["--target", "book", "--wanted-px", "100"], 100),
+    (["--target", "book", "--focal-mm", "20"], None), ([], None),
 ])  # fmt: skip
 def test_aim_shows_a_target_as_large_as_follow_does(folder, capsys, more, wanted_px):
     """As large as its profile says, where neither --wanted-px nor --focal-mm says otherwise."""
@@ -246,10 +250,39 @@ def test_version(capsys):
     assert call(capsys, "--version")[:2] == (0, f"cotarget {cotarget.__version__}\n")
 
 
-def test_ctrl_c_ends_without_a_traceback(folder, capsys, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
+COMMAND = """
+import sys
+from cotarget.cli import main
+assert main(["board", "--out", sys.argv[1]]) == 0
+from threadpoolctl import threadpool_info
+print(*{pool["num_threads"] for pool in threadpool_info()})
+"""
 
-    monkeypatch.setattr("cotarget.calibration.Calibration.load", interrupted)
-    status, out, err = call(capsys, *AIM, "--depth", "5")
-    assert (status, out, err) == (130, "", "cotarget aim: interrupted\n")
+
+@pytest.mark.parametrize(("environment", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
+def test_command_uses_one_thread_of_linear_algebra(environment, threads, tmp_path):
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("with one core there is never a second thread")
+    clean = {name: value for name, value in os.environ.items() if name not in LINEAR_ALGEBRA}
+    command = [sys.executable, "-c", COMMAND, str(tmp_path / "board.svg")]
+    made = subprocess.run(command, env=clean | environment, capture_output=True, text=True, check=True)
+    assert made.stdout.splitlines()[-1] == threads
+
+
+def test_every_key_that_is_taken_in_has_its_default(capsys):
+    assert main(["config"]) == 0
+    lines, keys = [], 0
+    for line in capsys.readouterr().out.splitlines():
+        if re.match(r"#\w+ = ", line):
+            try:
+                tomllib.loads(line[1:])
+            except tomllib.TOMLDecodeError:  # the form of a key without a default
+                continue
+            line, keys = line[1:], keys + 1
+        lines.append(line)
+    found, usual = parse_config(tomllib.loads("\n".join(lines))), parse_config({})
+    assert keys > 100
+    assert repr(replace(found, hardware=HardwareConfig())) == repr(usual)  # poses are printed to eight digits
+    assert {name: device.settings for name, device in devices(found.hardware).items()} == {
+        name: device.settings for name, device in devices(usual.hardware).items()
+    }

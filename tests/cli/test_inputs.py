@@ -8,16 +8,7 @@ import pytest
 
 from cotarget.backends import OPENERS
 from cotarget.config import RigConfig
-from tests.support.commands import (
-    OLD,
-    bird_film,
-    board_photo,
-    call,
-    capture,
-    refused,
-    true_calibration,
-    write_index,
-)
+from tests.support.commands import OLD, bird_film, board_photo, call, capture, refused, true_calibration, write_index
 from tests.support.recorded_run import calibration_file, record, toy_rig
 
 RIG = """

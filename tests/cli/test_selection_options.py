@@ -27,17 +27,10 @@ def track(number, center=(1, 1), confirmed=True):
 
 
 @pytest.mark.parametrize(("arguments", "recorded", "number"), [
-    ((), None, 2),
-    (("--policy", "first-come"), None, 2),
-    (("--policy", "nearest-deadline"), None, 5),
-    (("--policy", "most-served"), None, 2),
-    (("--click", "325", "210"), None, 3),
-    (("--click", "325", "400"), None, None),
-    (("--track", "5"), None, 5),
-    (("--track", "4"), None, None),
-    ((), {"track": 5}, 5),
-    ((), {"click": [325, 210.0]}, 3),
-    ((), {"policy": "nearest-deadline"}, 5),
+    ((), None, 2), (("--policy", "first-come"), None, 2), (("--policy", "nearest-deadline"), None, 5),
+    (("--policy", "most-served"), None, 2), (("--click", "325", "210"), None, 3),
+    (("--click", "325", "400"), None, None), (("--track", "5"), None, 5), (("--track", "4"), None, None),
+    ((), {"track": 5}, 5), ((), {"click": [325, 210.0]}, 3), ((), {"policy": "nearest-deadline"}, 5),
     (("--track", "3"), {"track": 5}, 3),
 ])  # fmt: skip
 def test_options_or_recording_select_the_target(arguments, recorded, number):
@@ -54,11 +47,8 @@ def test_options_or_recording_select_the_target(arguments, recorded, number):
 
 
 @pytest.mark.parametrize(("arguments", "recorded", "named"), [
-    (("--track", "4"), None, "--track"),
-    (("--click", "3", "4"), None, "--click"),
-    ((), {"track": 4}, "the recorded track"),
-    ((), {"click": [3.0, 4.0]}, "the recorded click"),
-    ((), None, None),
+    (("--track", "4"), None, "--track"), (("--click", "3", "4"), None, "--click"),
+    ((), {"track": 4}, "the recorded track"), ((), {"click": [3.0, 4.0]}, "the recorded click"), ((), None, None),
 ])  # fmt: skip
 def test_unmatched_selection_is_reported_with_the_tracks_seen(arguments, recorded, named):
     selection = chosen(*arguments, recorded=recorded)

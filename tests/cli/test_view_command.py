@@ -1,7 +1,6 @@
 """The viewer: frusta, pictures, real time, and the page for a browser."""
 
 import gc
-import itertools
 import urllib.error
 import urllib.request
 import warnings
@@ -13,15 +12,12 @@ import pytest
 
 from cotarget.cli import view
 from cotarget.config import RigConfig, SimConfig
-from cotarget.errors import DeviceError
-from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.viewer import browser, desktop
-from cotarget.sim.viewer.scene import FAR, SIDE_POINTS, Snapshot, WorldCopy, frusta_of, frustum_rim, line_geoms
+from cotarget.sim.viewer.scene import FAR, SIDE_POINTS, Snapshot, WorldCopy, frusta_of, frustum_rim
 from cotarget.sim.world import SimWorld
 from tests.support.commands import call
 
 NEAR_PX = 1e-6  # rounding, and the inverse of the distortion
-NEAR_M = 1e-5  # MjvGeom has floats of 32 bits
 ANSWER_S = 5.0
 
 
@@ -51,16 +47,6 @@ def test_a_frustum_ends_at_the_corners_of_the_image(world, camera, t, depth):
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     independent, _ = cv2.projectPoints(x_camera.copy(), np.zeros(3), np.zeros(3), K, np.array(lens.distortion))
     np.testing.assert_allclose(independent[:, 0], border, atol=NEAR_PX)
-
-
-def test_lines_are_drawn_from_end_to_end(world):
-    lines = frusta_of(world.truth(), 5.0)
-    geoms = [mujoco.MjvGeom() for _ in range(100)]
-    assert line_geoms(Snapshot(5.0, "", {}, lines), iter(geoms)) == 2 * (4 * SIDE_POINTS + 4)
-    for (begin, end), geom in zip(itertools.chain(*lines.values()), geoms, strict=False):
-        along = geom.mat.reshape(3, 3)[:, 2] * geom.size[2]
-        np.testing.assert_allclose(geom.pos, begin, atol=NEAR_M)
-        np.testing.assert_allclose(geom.pos + along, end, atol=NEAR_M)
 
 
 class WallClock:
@@ -139,39 +125,6 @@ def test_view_refuses_a_target_that_follow_refuses(tmp_path, capsys, monkeypatch
     assert (status, "rig.toml: targets.book.size: 23.4" in said, "--insist" in said) == (1, True, True)
 
 
-@pytest.fixture
-def unserved(monkeypatch):
-    """A web viewer whose thread ends at once and which notes that it was closed."""
-    closed = []
-
-    def launch(serve):
-        if serves:
-            serve(None)
-        return SimpleNamespace(close=lambda: closed.append("viewer"))
-
-    serves = []
-    monkeypatch.setattr(browser.launch_thread, "launch_thread", launch)
-    monkeypatch.setattr(browser, "START_S", 0.0)
-    return serves, closed
-
-
-@pytest.mark.parametrize(("fails", "said"), [(None, "within 0 s"), (OSError("no more threads"), "no more threads")])
-def test_failed_page_releases_viewer_and_port(world, monkeypatch, unserved, fails, said):
-    serves, closed = unserved
-
-    def refuse(*_):
-        raise fails
-
-    if fails:
-        serves.append(True)
-        monkeypatch.setattr(browser.BrowserWindow, "_viewer", refuse)
-    listener = browser.listen(0)
-    with pytest.raises(DeviceError, match=said):
-        browser.BrowserWindow(world.truth(), listener)
-    assert closed == ["viewer"]
-    assert listener.fileno() == -1
-
-
 @pytest.mark.parametrize("window", [(1200, 900), (333, 777), (90, 70)])
 def test_window_pictures_fill_their_places_one_above_the_other(window):
     """MuJoCo draws as many pixels as the place has, whatever the size of the picture."""
@@ -215,28 +168,3 @@ def test_page_is_served_to_this_machine_until_the_window_closes(world):
             gc.collect()
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(where, timeout=ANSWER_S)
-
-
-def test_overlay_uploads_only_new_pictures(world):
-    sent = []
-
-    def upload(texture, pixels, width, height, bytes_a_pixel):
-        sent.append((texture, pixels[:4], width, height))
-        assert len(pixels) == width * height * bytes_a_pixel
-        return texture or len(sent)
-
-    overlay = browser.Overlay(lambda *_: None)
-    overlay.viewer = SimpleNamespace(extra_geoms=[], upload_image=upload)
-    overlay.on_update(None)
-    assert not sent
-    red = np.zeros((480, 640, 3), np.uint8)
-    red[..., 2] = 255
-    lines = frusta_of(world.truth(), 5.0)
-    overlay.sight = Snapshot(5.0, "", {"fixed": red, "zoom": red}, lines)
-    for _ in range(2):
-        overlay.on_update(None)
-        assert len(overlay.viewer.extra_geoms) == sum(map(len, lines.values()))
-    assert sent == [(0, b"\xff\0\0\xff", browser.PICTURE_PX, 300)] * 2
-    overlay.sight = Snapshot(5.1, "", {"fixed": red}, lines)
-    overlay.on_update(None)
-    assert [texture for texture, *_ in sent] == [0, 0, 1]

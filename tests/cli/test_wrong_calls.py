@@ -50,7 +50,6 @@ FILES = {
     "late.csv": "frame,x_px,y_px,width_px,height_px\n900,1,2,3,4\n",
     **dict.fromkeys(("out.json", "out.csv", "out.mp4"), OLD),
     "index/index.json": '{"schema": 1, "board": 5, "pitch_mm": null, "captures": [1]}',
-    "cut/index.json": '{"schema": 1, "boa',
 }
 AIM = "aim --calibration good.json --pixel 320 240"
 FOLLOW = "follow --calibration good.json --rig rig.toml --target book"
@@ -63,9 +62,7 @@ POSE = "millimetres.json: T_zoom0_fixed"
 # The command line, the exit status, and what the line names.
 CALLS = [
     ("dance", USAGE, "'dance'", "calibrate"),
-    ("demo --seed 1.5", USAGE, "--seed", "'1.5'"),
     ("demo --out film.mp4", FAILED, "film.mp4"),
-    ("demo --out out.json/x", FAILED, "out.json/x"),
     # calibrate
     ("calibrate --rig folder", FAILED, "folder"),
     ("calibrate --rig moon.toml", FAILED, "moon.toml: ", "'moon'", "indoor, outdoor"),
@@ -73,7 +70,6 @@ CALLS = [
     ("calibrate --rig rig.toml --out folder", FAILED, "folder: "),
     ("calibrate --rig replay.toml --out new.json", FAILED, "replay.toml: backend is 'replay'"),
     ("calibrate --rig rig.toml --board 9x6", FAILED, "--board", "--from"),
-    ("calibrate --rig rig.toml --kind charuco", FAILED, "--kind", "--from"),
     ("calibrate --rig rig.toml --insist --method sequential", FAILED, "--insist", "--method joint"),
     (f"{OUT} --from grey {PHOTOS}", FAILED, "grey: ", "9x6"),
     (f"{OUT} --from folder {PHOTOS}", FAILED, "folder: ", "'left*.png'"),
@@ -81,15 +77,11 @@ CALLS = [
     (f"{OUT} --from folder", FAILED, "folder: ", "index.json"),
     (f"{OUT} --from film.mp4", FAILED, "film.mp4: "),
     (f"{OUT} --from index", FAILED, "index/index.json: ", "board"),
-    (f"{OUT} --from cut", FAILED, "cut/index.json: "),
     (f"{OUT} --from no_fixed", FAILED, "no_fixed: ", "fixed camera"),
-    (f"{OUT} --from no_zoom", FAILED, "no_zoom: ", "zoom camera"),
     (f"{OUT} --from index --kind charuco", FAILED, "--fixed, --zoom, --board and --square"),
     (f"{OUT} --from index --encoders --method sequential", FAILED, "--encoders", "--method joint"),
     (f"{OUT} --from index --captures x", FAILED, "--captures", "--rig"),
-    (f"{OUT} --from index --stops 3", FAILED, "--stops", "--rig"),
     (f"{SINGLE} --square 0.1 --board 9by6", USAGE, "--board", "9by6", "9x6"),
-    (f"{SINGLE} --square 0.1 --board 2x6", USAGE, "--board", "2x6"),
     (f"{SINGLE} --square 0.1 --board 7x6", FAILED, "single: ", "7x6"),
     (f"{SINGLE} --square 25 --board 9x6", FAILED, "--square", "0.025"),
     (f"{OUT} --from single {PHOTOS} --kind charuco", FAILED, "single: ", "charuco of 9x6"),
@@ -99,13 +91,9 @@ CALLS = [
     ("report millimetres.json --out page.html", FAILED, POSE, "metres", "--insist"),
     ("report good.json --out film.mp4/page.html", FAILED, "film.mp4/page.html: "),
     ("board --out new.txt", FAILED, "new.txt", ".pdf, .png, .svg"),
-    ("board --out new.pdf --square 25", FAILED, "--square", "0.025"),
     # aim
     (f"{AIM} --depth -3", USAGE, "--depth", "-3"),
-    (f"{AIM} --depth nan", USAGE, "--depth", "nan"),
-    (f"{AIM} --depth 1e300", FAILED, "1e+300"),
     (f"{AIM} --depth 9 --rig crow.toml --target crow", FAILED, "crow.toml: targets.crow.size", "cm are 1.8; --insist"),
-    (f"{AIM} --depth 5 --fast", USAGE, "--fast"),
     (f"{AIM} --depth 5 --rig typo.toml", FAILED, "typo.toml", "sim.scenery", "scene"),
     (f"{AIM} --depth 5 --rig replay.toml", FAILED, "replay.toml: backend is 'replay'"),
     (f"{AIM} --depth 5 --rig other_shape.toml", FAILED, "good.json: ", "640x360", "640x480"),
@@ -117,9 +105,7 @@ CALLS = [
     (f"{AIM} --depth 5 --focal-mm 100", FAILED, "--focal-mm", "100", "6 to 72 mm"),
     (f"{AIM} --size-px 16", FAILED, "--size-px", "--target"),
     (f"{AIM} --size-px 5000 --target book", FAILED, "--size-px", "book of 0.234 m", "640x480"),
-    (f"{AIM} --size-px 1e-320 --target book", FAILED, "--size-px"),
     ("aim --calibration good.json --pixel 640 240 --depth 5", FAILED, "--pixel", "(640, 240)", "640x480"),
-    ("aim --calibration good.json --pixel nan 240 --depth 5", FAILED, "--pixel", "(nan, 240)"),
     ("aim --calibration headless.json --pixel 3 4 --depth 5", FAILED, "T_head_zoom"),
     ("aim --calibration millimetres.json --pixel 3 4 --depth 5", FAILED, POSE, "metres", "--insist"),
     ("aim --calibration wide.json --pixel 3 4 --depth 5 --rig rig.toml", FAILED, "wide.json: ", "640x360"),
@@ -149,17 +135,13 @@ CALLS = [
     ("latency --rig nameless.toml", FAILED, "hardware.head.port", "/dev/tty"),
     ("latency --rig hw.toml", FAILED, "http://127.0.0.1:9"),
     ("latency --rig rig.toml --calibration headless.json", FAILED, "T_head_zoom"),
-    ("latency --rig rig.toml --calibration millimetres.json", FAILED, POSE, "metres", "--insist"),
     ("stop --rig unstoppable.toml", FAILED, "unstoppable.toml: safety.stop_file: 5"),
     ("clear --rig sim.toml", FAILED, "sim.toml: ", "[safety] stop_file"),
     ("reset-head --rig sim.toml --yes", FAILED, "sim.toml: "),
-    ("reset-head --rig nameless.toml --yes", FAILED, "nameless.toml: "),
     ("reset-head --rig hw.toml --yes", FAILED, NO_PORT),
     ("emulate --rig hw.toml --write new.toml", FAILED, "hw.toml: backend"),
     ("emulate --write new.toml --user root", FAILED, "--user", "COTARGET_PASSWORD"),
     ("emulate --write new.toml --fault silence", FAILED, "--fault", "'silence'", "fixed., head., zoom."),
-    ("emulate --write new.toml --fault head.rust", FAILED, "--fault", "'head.rust'", "garbage", "silence"),
-    ("emulate --write new.toml --head 65536", USAGE, "--head", "'65536'"),
     # what shows and inspects
     ("view --port 5", FAILED, "--port", "--browser"),
     ("view --calibration good.json", FAILED, "--calibration", "--target"),
@@ -212,7 +194,7 @@ OPENED = [
 def made(tmp_path_factory):
     """A folder with good and wrong rigs and calibrations, and old results."""
     folder = tmp_path_factory.mktemp("calls")
-    for name in ("folder", "index", "cut", "no_fixed", "no_zoom", "grey", "single"):
+    for name in ("folder", "index", "no_fixed", "grey", "single"):
         (folder / name).mkdir()
     for name, text in FILES.items():
         (folder / name).write_text(text)
@@ -223,9 +205,8 @@ def made(tmp_path_factory):
     true_calibration(RigConfig(), zoom_size=(640, 360)).save(folder / "wide.json")
     true_calibration(RigConfig(), with_head=False).save(folder / "headless.json")
     with_zoom_head(good, T_zoom0_fixed=wide_apart).save(folder / "millimetres.json")
-    for name, camera in (("no_fixed", "zoom"), ("no_zoom", "fixed")):
-        cv2.imwrite(str(folder / name / "a.png"), board_photo())
-        write_index(folder / name, [capture("a.png", camera)])
+    cv2.imwrite(str(folder / "no_fixed" / "a.png"), board_photo())
+    write_index(folder / "no_fixed", [capture("a.png", "zoom")])
     for side in ("left", "right"):
         for number in range(4):
             cv2.imwrite(str(folder / "grey" / f"{side}{number}.png"), np.full((120, 160, 3), 128, np.uint8))
