@@ -17,7 +17,6 @@ from cotarget.geometry import RigidTransform
 from cotarget.rig import Detection
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import Reach, aim, depth_of, point_at
-from cotarget.tracking.track import LiveTrack, tracking_settings
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth
 from tests.support.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
 from tests.support.rigs import with_zoom_head
@@ -75,30 +74,6 @@ def errors(flight, **how):
     return np.array(misses), np.array(squared)
 
 
-def baselines(flight):
-    """Misses without prediction, and with constant velocity in the image, (n, delays) each."""
-    state, still, straight = None, [], []
-    for t in flight.times:
-        seen = flight.wide(t)
-        if seen is None:
-            continue
-        if state is None:
-            state = LiveTrack(1, seen, t, tracking_settings(flight.target))
-        else:
-            state.predict(t)
-            state.correct(seen)
-        if t < SETTLED_S or not flight.visible(t + DELAYS[-1]):
-            continue
-        track = state.track()
-        sides = {"width": track.size_px[0], "height": track.size_px[1], "wingspan": track.larger_side_px}
-        depth = depth_of(flight.calibration, flight.target, sides[flight.target.dimension], track.center_px)
-        here = point_at(flight.calibration, seen.center_px, depth)
-        still.append([flight.miss_percent(here, t + d) for d in DELAYS])
-        ahead = [point_at(flight.calibration, track.center_px + d * track.velocity_px, depth) for d in DELAYS]
-        straight.append([flight.miss_percent(x, t + d) for x, d in zip(ahead, DELAYS, strict=True)])
-    return np.array(still), np.array(straight)
-
-
 # ---------------------------------------------------------------- prediction
 def test_the_covariance_is_honest_where_targets_move_as_assumed():
     """Squared errors of (a, b, l, velocity) average 6 over 30 random targets that accelerate as Singer's."""
@@ -120,28 +95,6 @@ def test_the_covariance_is_honest_where_targets_move_as_assumed():
     # The mean of 30 chi-squares with 6 degrees of freedom has a standard deviation of 0.63; that the target's
     # velocity is drawn narrower and its size clipped makes the errors a little smaller.
     assert 6 - 4 * 0.63 < np.mean(squared) < 6 + 3 * 0.63
-
-
-# At 200 ms: at least so many times better than no prediction, and than constant velocity in the image.
-FACTORS = {"person": (3.0, 1.4), "bird": (9.0, 2.0)}
-
-
-@pytest.mark.parametrize("name", [pytest.param("person", marks=pytest.mark.slow), "bird"])
-def test_prediction_beats_none_and_constant_velocity_in_the_image(name):
-    found = [errors(Flight(name, seed)) for seed in range(3)]
-    others = [baselines(Flight(name, seed)) for seed in range(3)]
-    misses, squared = (np.concatenate(part) for part in zip(*found, strict=True))
-    still, straight = (np.median(np.concatenate(part), axis=0) for part in zip(*others, strict=True))
-    median = np.median(misses, axis=0)
-    at = DELAYS.index(0.2)
-    none, image = FACTORS[name]
-    assert still[at] > none * median[at]
-    assert straight[at] > image * median[at]
-    assert (np.diff(median) > 0).all()
-    assert (median[1:] < straight[1:]).all()
-    # Two degrees of freedom; real turns are no Singer's noise, and errors of one track hang together.
-    assert (squared.mean(axis=0) < 4.5).all()
-    assert (squared.mean(axis=0) > 0.5).all()
 
 
 def test_a_book_that_is_put_elsewhere_is_predicted_there():
