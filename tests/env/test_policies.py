@@ -164,18 +164,6 @@ def test_the_pipeline_follows_and_chance_does_not(field, target, seconds, least)
     env.close()
 
 
-def test_the_pipeline_asked_again_before_the_next_step_says_the_same(field):
-    env = Follow("book", rig=field, seconds=1.0)
-    policy = PipelinePolicy(env)
-    observation, _ = env.reset(seed=0)
-    for _ in range(5):
-        t, action = env.episode.rig.clock.now(), policy(observation)
-        assert policy(observation) is action
-        assert env.episode.rig.clock.now() == t
-        observation, *_ = env.step(action)
-    env.close()
-
-
 def test_a_calibration_that_is_wrong_serves_worse(field):
     """Turned by 3 degrees: what the pipeline aims at by it is beside the close-up."""
     rig = Follow("book", rig=field, seconds=4.0)

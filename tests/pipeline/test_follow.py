@@ -221,21 +221,6 @@ def test_nothing_is_detected(part, reason):
     assert len(steps) == pytest.approx(2.0 * RATE_HZ, abs=2)
 
 
-@pytest.mark.parametrize("seen", [False, True])
-def test_the_foreground_is_asked_for_once_a_frame(seen):
-    """`auto` makes it at each access, which takes as long as a third of the detection at 4K."""
-
-    class Counting(Seer):
-        asked = 0
-
-        @property
-        def mask(self):
-            self.asked += 1
-
-    seer = Counting(still, lambda t: seen)
-    assert len(run(FormulaRig(), seer, 1.0)) == seer.asked
-
-
 def test_gap_in_the_frames_is_survived():
     """0.5 s without a frame while the target goes on: it is the same track, and the head does not run away."""
     rig = FormulaRig(dropped=(1.5, 2.0))

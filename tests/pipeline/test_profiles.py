@@ -42,15 +42,10 @@ def test_tracks_of_an_own_detector_are_confirmed_by_their_number(name):
     assert (settings.confirm_travel, settings.confirm_score) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("dimension", "box", "vertical", "sides"),
-    [
-        ("height", (3.0, 1.0), True, (3.0, 1.0)),
-        ("width", (1.0, 2.0), False, (1.0, 2.0)),
-        ("wingspan", (4.0, 1.0), False, (1.0, 0.25)),
-        ("wingspan", (1.0, 4.0), True, (0.25, 1.0)),
-    ],
-)
+@pytest.mark.parametrize(("dimension", "box", "vertical", "sides"), [
+    ("height", (3.0, 1.0), True, (3.0, 1.0)), ("width", (1.0, 2.0), False, (1.0, 2.0)),
+    ("wingspan", (4.0, 1.0), False, (1.0, 0.25)), ("wingspan", (1.0, 4.0), True, (0.25, 1.0)),
+])  # fmt: skip
 def test_the_dimension_of_a_box(dimension, box, vertical, sides):
     profile = replace(CAR, dimension=dimension)
     assert profile.is_vertical(*box) == vertical

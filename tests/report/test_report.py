@@ -23,7 +23,6 @@ from cotarget.report.analysis import (
     averaged,
     empty_places,
     gather,
-    given,
     left_open,
     lens_curves,
     pointing,
@@ -31,7 +30,7 @@ from cotarget.report.analysis import (
     with_more_placements,
 )
 from cotarget.report.page import write_report
-from cotarget.report.text import advice, digits, judge, percent, value_and_sigma
+from cotarget.report.text import advice, digits, judge
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, SIZES, Lens, Stop, Truth
 from experiments.calibration.synthetic.views import Placing, synthetic_views
@@ -365,12 +364,6 @@ def test_more_placements_do_not_reduce_jitter_or_interpolation_error(plain, stop
     }
 
 
-def test_conditional_covariance_is_the_schur_complement():
-    covariance = Covariance(("a", "b"), np.array([[4.0, 2.0], [2.0, 3.0]]))
-    left = given(covariance, np.array([False, True])).matrix
-    assert left == pytest.approx(np.array([[4 - 2 * 2 / 3, 0], [0, 0]]))  # Schur's complement
-
-
 def test_lens_curves_have_the_uncertainty_of_the_zoom_samples(stops):
     curves = lens_curves(stops)
     for where, i in ((0, 0), (-1, 1)):
@@ -382,15 +375,6 @@ def test_lens_curves_have_the_uncertainty_of_the_zoom_samples(stops):
         grown = (nominal / stops.zoom_head.lens.nominal_px[0]) ** 2
         assert curves.sigmas["kappa1"][where] == pytest.approx(sigma(f"zoom[{i}].k1") / grown, rel=1e-4)
     assert curves.sigmas["pupil_mm"][-1] == pytest.approx(1000 * stops.covariance.sigma("zoom[1].pupil"), rel=1e-4)
-
-
-def test_number_formatting():
-    assert [digits(x) for x in (0.00213, 0.0996, 12.4, 7155.0, 0.0)] == ["0.0021", "0.10", "12", "7200", "0"]
-    assert value_and_sigma(692.3149, 0.237) == "692.31 ± 0.24"
-    assert value_and_sigma(-1.5, 0.0996) == "-1.50 ± 0.10"
-    assert value_and_sigma(1234.5, 37.0) == "1234 ± 37"
-    assert value_and_sigma(0.5, None) == "0.500000"
-    assert [percent(x) for x in (0.0004, 0.03, 1.0)] == ["0.04 %", "3 %", "100 %"]
 
 
 def test_report_command_keeps_the_old_page_unless_all_is_written(plain, tmp_path, capsys):
