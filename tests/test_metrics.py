@@ -13,34 +13,12 @@ EXACT = 1e-9
 CENTRE = (319.5, 239.5)  # of a 640x480 image whose pixel centres are whole numbers
 HALF_DIAGONAL = 400.0  # of 640x480
 GOOD = Row(
-    t_s=0.0,
-    t_fixed_s=0.0,
-    state="following",
-    track=1,
-    u_px=CENTRE[0],
-    v_px=CENTRE[1],
-    width_px=640,
-    height_px=480,
-    size_px=160.0,
-    wanted_px=160.0,
-    visible=1.0,
-    in_wide=True,
-    u_wide_px=100.0,
-    v_wide_px=50.0,
-    u_detected_px=100.0,
-    v_detected_px=50.0,
-    decoded=True,
-    decoded_wide=False,
-    off_target="",
-    range_m=10.0,
-    depth_m=10.0,
-    pan_commanded_deg=1.0,
-    tilt_commanded_deg=2.0,
-    focal_commanded_px=5000.0,
-    pan_deg=1.0,
-    tilt_deg=2.0,
+    t_s=0.0, t_fixed_s=0.0, state="following", track=1, u_px=CENTRE[0], v_px=CENTRE[1], width_px=640, height_px=480,
+    size_px=160.0, wanted_px=160.0, visible=1.0, in_wide=True, u_wide_px=100.0, v_wide_px=50.0, u_detected_px=100.0,
+    v_detected_px=50.0, decoded=True, decoded_wide=False, off_target="", range_m=10.0, depth_m=10.0,
+    pan_commanded_deg=1.0, tilt_commanded_deg=2.0, focal_commanded_px=5000.0, pan_deg=1.0, tilt_deg=2.0,
     focal_px=1000.0,
-)
+)  # fmt: skip
 AWAY = {"u_px": 700.0, "visible": 0.0}
 
 
@@ -54,26 +32,12 @@ def test_a_perfect_run():
     """Two seconds of learning do not count: 50 of 150 rows lie before t = 2 s."""
     found = score(run((150, {})))
     assert found == Score(
-        frames=100,
-        time_to_acquire_s=0.0,
-        closeup_yield=1.0,
-        in_frame_ratio=1.0,
-        tpo_px_median=0.0,
-        tpo_width_median=0.0,
-        tpo_deg_median=0.0,
-        size_ratio_median=1.0,
-        wanted_px=160.0,
-        range_m=10.0,
-        tpe_px_median=0.0,
-        fragmentation_per_min=0.0,
-        identification=1.0,
-        identification_wide=0.0,
-        commands_per_min=0.0,
-        reversals_per_min=0.0,
-        false_tracks_per_min=0.0,
-        lens_commands_per_min=0.0,
+        frames=100, time_to_acquire_s=0.0, closeup_yield=1.0, in_frame_ratio=1.0, tpo_px_median=0.0,
+        tpo_width_median=0.0, tpo_deg_median=0.0, size_ratio_median=1.0, wanted_px=160.0, range_m=10.0,
+        tpe_px_median=0.0, fragmentation_per_min=0.0, identification=1.0, identification_wide=0.0,
+        commands_per_min=0.0, reversals_per_min=0.0, false_tracks_per_min=0.0, lens_commands_per_min=0.0,
         id_switches_per_min=0.0,
-    )
+    )  # fmt: skip
 
 
 def test_counting_starts_with_the_target_wholly_in_the_fixed_view_after_2_s():
@@ -86,12 +50,8 @@ def test_counting_starts_with_the_target_wholly_in_the_fixed_view_after_2_s():
     assert early.time_to_acquire_s == pytest.approx(10 * PERIOD, abs=EXACT)
     gone_again = score(run((60, {}), (40, {"in_wide": False, **AWAY})))
     assert gone_again.frames == 50
-
-
-def test_the_2_s_are_counted_from_the_first_row_on():
-    """A clock that stood at 1000 s when the run began: 50 of 120 rows lie before 1002 s."""
     rows = [dataclasses.replace(row, t_s=1000.0 + row.t_s) for row in run((120, {}))]
-    assert score(rows).frames == 70
+    assert score(rows).frames == 70  # the clock may begin anywhere
 
 
 def test_acquisition_is_at_the_start_of_the_first_half_second_in_frame():
@@ -100,13 +60,6 @@ def test_acquisition_is_at_the_start_of_the_first_half_second_in_frame():
     assert found.time_to_acquire_s == pytest.approx((90 - 50) * PERIOD, abs=EXACT)
     assert found.in_frame_ratio == 1.0  # counted from row 90 on
     assert found.closeup_yield == pytest.approx((12 + 30) / 70)  # counted from row 50 on
-
-
-def test_a_score_in_one_line():
-    late = run((60, AWAY), (90, {"u_px": CENTRE[0] + 6.4, "size_px": 168.0}))
-    assert score(late).summary() == "acquired after 0.40 s, yield 0.90, offset 1.0% of the width, size ratio 1.05"
-    assert score(run((150, AWAY))).summary() == "never acquired in 100 frames"
-    assert score(run((150, {"in_wide": False}))).summary() == "never wholly in the fixed view"
 
 
 def test_lost_frames_count():
@@ -127,7 +80,7 @@ def test_a_target_behind_the_camera_has_size_0_and_the_largest_offset():
     assert found.tpo_width_median == pytest.approx(HALF_DIAGONAL / 640)
 
 
-def test_never_acquired_and_never_there():
+def test_never_acquired_never_there_and_a_single_row():
     never = score(run((100, AWAY)))
     assert (never.frames, never.closeup_yield) == (50, 0.0)
     for field in ("time_to_acquire_s", "in_frame_ratio", "tpo_px_median", "tpo_width_median", "tpo_deg_median",
@@ -136,6 +89,9 @@ def test_never_acquired_and_never_there():
     assert never.range_m == 10.0
     for rows in ([], run((100, {"in_wide": False})), run((40, {}))):
         assert score(rows) == Score(0, *[None] * 11)
+    found = score(run((51, {})))
+    assert found.frames == 1
+    assert (found.commands_per_min, found.reversals_per_min, found.false_tracks_per_min) == (None, None, None)
 
 
 @pytest.mark.parametrize(("change", "in_frame", "good"), [
@@ -270,12 +226,6 @@ def test_false_tracks(parts, count):
 ])  # fmt: skip
 def test_id_switches(parts, count):
     assert score(run((50, {}), *parts)).id_switches_per_min == pytest.approx(count / COUNTED_MIN)
-
-
-def test_a_single_row_has_no_rates():
-    found = score(run((51, {})))
-    assert found.frames == 1
-    assert (found.commands_per_min, found.reversals_per_min, found.false_tracks_per_min) == (None, None, None)
 
 
 def test_the_table_comes_back_exactly(tmp_path):
