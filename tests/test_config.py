@@ -1,12 +1,14 @@
 """rig.toml: defaults, every section, and one clear line for each mistake."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from cotarget.backends import check, load_config
+from cotarget.backends import check, describe, load_config
 from cotarget.config import SimEffects, config_of, parse_config
+from cotarget.drivers.board import socket_address
 from cotarget.errors import ConfigError
 
 DOG = "[targets.dog]\nsize = 0.6\ndimension = 'height'\nwanted_px = 200\ndetector = 'motion'\n"
@@ -20,22 +22,17 @@ REFUSED = {
     "safety.stop_file": ["''", "'.'", "'run/..'", "1"],
     "safety.tilt_deg": ["30"],
     "safety.watchdog_s": ["0", "350", "inf", "0.04"],  # a frame comes each 0.04 s
-    "sim": ["3"],
-    "sim.effects.all": ["0"],
     "sim.fixed.center_px": ["[700, 239]"],
     "sim.fixed.distortion": ["[-0.5, 0, 0, 0, 0]"],  # folds back inside the image
     "sim.fixed.focal_px": ["[0, 1]"],
     "sim.fixed.jpeg_quality": ["0"],
     "sim.fixed.noise": ["'much'", "-1"],
-    "sim.fixed.rate_hz": ["1e9"],
     "sim.fixed.size": ["[640]", "[640, 480.5]", "640"],
     "sim.head.pan_deg": ["[10, -10]", "90"],
     "sim.head.squareness_deg": ["-90"],
     "sim.paths": ["{ boook = [[0, 0, 0, 0], [1, 0, 0, 0]] }"],
     "sim.paths.bird": ["3", "[0, 0, 20, 5]", "[[1, 0, 0, 0], [1, 1, 0, 0]]"],
     "sim.T_head_zoom": ["3", "{ translation = 1, rotvec_deg = [0, 0, 0] }", "{ translation = [0, 0, 0] }"],
-    "sim.T_zoom0_fixed.rotvec_deg": ["[1e308, 1e308, 0]\nsim.T_zoom0_fixed.translation = [0, 0, 0]"],
-    "sim.T_zoom0_fixed.translation": ["[1e300, 0, 0]\nsim.T_zoom0_fixed.rotvec_deg = [0, 0, 0]"],
     "sim.targets": ["['cow']", "['dog']", "['bird', 'bird2', 'bird']", "'bird'"],
     "sim.zoom.center_drift_px": ["[[1, 2]]", "[1, 2]", "[[0], [480]]"],
     "sim.zoom.center_px": ["[326, -1]"],
@@ -43,7 +40,6 @@ REFUSED = {
     "sim.zoom.exposure_s": ["10"],  # longer than from one frame to the next
     "sim.zoom.focal_curve": ["[0.1, nan]", "[-0.95]", "[1e308, 1e308]"],
     "sim.zoom.pupil": ["-0.08", "[-80]"],
-    "sim.zoom.size": ["[0, 480]"],
     "targets.bird.size": ["0"],
     "targets.cow": ["{ size = 2.0 }"],
 }
@@ -209,3 +205,60 @@ def test_numbered_target_defaults_to_its_kind():
     for name in ("bird1", "bird02", "bird2x", "2", "cow2"):
         with pytest.raises(ConfigError, match=f"unknown target '{name}'; the targets are: bird, bird3, book, person"):
             config.target(name)
+
+
+# Values that a key of [hardware] refuses.
+REFUSED_HARDWARE = {
+    "head.port": ["3"],
+    "head.baud": ["9601"],
+    "head.pan_sign": ["2", "true"],
+    "head.tilt_deg": ["[30, -40]"],
+    "head.step_deg": ["0"],
+    "fixed.url": ["'192.168.0.90'", "'http://[::1'", "'http://host:port'"],
+    "fixed.compression": ["101"],
+    "fixed.latency_s": ["-0.1"],
+    "fixed.driver": ["3"],
+    "zoom.lens": ["[[0, 6.0]]", "[[0, 6.0], [9, 5.0]]", "[[0, 0.0], [9, 5.0]]"],
+    "board.presenter": ["'nobody'"],
+}
+
+
+def refused_hardware(text):
+    with pytest.raises(ConfigError) as error:
+        check(parse_config(tomllib.loads(text)))
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [(key, value) for key, values in REFUSED_HARDWARE.items() for value in values]
+)
+def test_refused_value_of_hardware_is_named_by_its_key(key, value):
+    assert refused_hardware(f"hardware.{key} = {value}").startswith((f"hardware.{key}: ", f"hardware.{key}["))
+
+
+def test_an_unknown_driver_is_refused_with_the_valid_ones():
+    assert refused_hardware("hardware.fixed.driver = 'axes'").endswith(": axis")
+
+
+@pytest.mark.parametrize("backend", ["hardware", "sim"])
+@pytest.mark.parametrize("camera", ["fixed", "zoom"])
+def test_latency_above_the_frame_age_limit_is_refused(backend, camera):
+    text = f"backend = '{backend}'\nsafety.max_frame_age_s = 2.0\n{backend}.{camera}.latency_s = "
+    check(parse_config(tomllib.loads(f"{text}1.9")))
+    assert refused_hardware(f"{text}20").startswith(f"{backend}.{camera}.latency_s: ")
+
+
+@pytest.mark.parametrize(("url", "address"), [
+    ("socket://10.0.0.2:4000", ("10.0.0.2", 4000)), ("socket://ptu.local:4000/", ("ptu.local", 4000)),
+    ("socket://[::1]:80", ("::1", 80)), ("/dev/ttyUSB0", None), ("socket://host", None), ("socket://host:port", None),
+])  # fmt: skip
+def test_socket_addresses(url, address):
+    assert socket_address(url) == address
+
+
+def test_the_drivers_describe_their_devices():
+    """Half the S5 IS's viewfinder width is 160 px of 17.94 um: at 6 mm its focal length is 334.4 px."""
+    spec = describe(parse_config(tomllib.loads('backend = "hardware"\nhardware.head.pan_deg = [-90, 90]')))
+    assert spec.zoom.focal_range == pytest.approx((6 / 0.01794, 72 / 0.01794))
+    assert (spec.fixed.size, spec.zoom.size) == ((704, 576), (320, 240))
+    assert spec.head.limits.pan.range == pytest.approx((-1.5707963, 1.5707963))

@@ -1,15 +1,23 @@
-"""The documentation names what there is; `mkdocs build --strict` checks the links within it."""
+"""The documentation names what there is: names, files, commands with their options, experiments, and examples."""
 
+import io
 import pkgutil
 import re
 import runpy
 import sys
 import types
+from argparse import Namespace
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
 
-from experiments.engine import experiment_of, pictured
+from cotarget import cli
+from cotarget.backends import load_config
+from cotarget.sim.world import SimWorld
+from experiments.command import choose, main
+from experiments.engine import experiment_of, known_experiments, pictured
+from tests.support.target_models import BOX
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -60,3 +68,94 @@ def test_reference_is_as_the_code_is_and_lists_options_keys_and_the_end_of_help(
     assert "exit status: 0 the target was followed" in commands
     assert "faults: head.silence" in commands
     assert "| `watchdog_s` | number | s | `0.35` | > 0.04 and ≤ 60 |" in keys
+
+
+EXAMPLE = "rounding"  # the experiment that docs/experiments.md adds
+HISTORY = ("upgrading.md", "CHANGELOG.md")  # these name what there was
+ALL_PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in ALL_PAGES if page.name not in HISTORY)
+# `cotarget NAME ... --option ...` up to where a line of code or of a shell ends.
+COMMANDS = re.findall(r"(?<![\w/.-])cotarget ([a-z-]+)((?: [^`\n|#]*)?)", TEXT)
+# `python -m experiments[.name] ...`, of which one line of code follows the other.
+EXPERIMENTS = re.findall(r"python -m experiments((?:\.[a-z_]+)*)((?: (?:(?!python -m)[^`#\n])*)?)(?=[`#\n])", TEXT)
+
+
+def asked(*arguments):
+    """What a command's --help says."""
+    with redirect_stdout(io.StringIO()) as out, pytest.raises(SystemExit) as ended:
+        cli.main([*arguments, "--help"])
+    assert ended.value.code == 0
+    return out.getvalue()
+
+
+def known(text):
+    return set(re.findall(r"^    ([a-z-]+)", text, re.MULTILINE))
+
+
+@pytest.fixture(scope="module")
+def helps():
+    existing = known(asked())
+    return {name: asked(name) for name in sorted({name for name, _ in COMMANDS} & existing)}
+
+
+def test_commands_and_their_options_exist(helps):
+    for name, rest in COMMANDS:
+        if name not in helps:
+            assert not rest.strip().startswith("--"), name  # prose, such as "cotarget makes the two cooperate"
+            continue
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest):
+            assert option in helps[name], f"cotarget {name} {option}"
+
+
+def test_experiments_and_their_options_exist():
+    assert len(EXPERIMENTS) > 8
+    known_names = known_experiments()
+    with pytest.raises(SystemExit), redirect_stdout(io.StringIO()) as said:
+        main(["--help"])
+    for module, rest in EXPERIMENTS:
+        if module:
+            assert module.rpartition(".")[2] in {*known_names, "gallery", "teaser", EXAMPLE}
+            continue
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest):
+            assert option in said.getvalue(), f"python -m experiments {option}"
+        names = [word for word in re.findall(r"^ ([a-z][a-z0-9_ ]+)(?= |$)", rest) for word in word.split()]
+        names = [name for name in names if name != EXAMPLE]
+        changes = re.findall(r"--set '?([^\s']+=[^\s']+)", rest)
+        assert choose(known_names, Namespace(names=names, set=changes, quick=False, seeds=None, seed_base=None))
+
+
+def test_every_command_is_documented(helps):
+    assert known(asked()) <= set(helps)
+
+
+def section(page, heading):
+    """A section of a page."""
+    (found,) = re.findall(rf"^## {heading}\n(.*?)^## ", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    return found
+
+
+def test_the_readmes_figures_are_those_of_the_results():
+    shown, measured = (
+        set(re.findall(r"\d[\d.]*", "\n".join(re.findall(r"^\|.*", section(ROOT / page, heading), re.MULTILINE))))
+        for page, heading in (("README.md", "How well it does"), ("docs/results.md", "Summary"))
+    )
+    assert len(shown) > 10
+    assert shown <= measured
+
+
+def file_of(page, name):
+    """The block that a page marks as a file."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    (found,) = re.findall(rf"<!-- file: {re.escape(name)} -->\n```\w+\n(.*?)```", text, re.DOTALL)
+    return found
+
+
+def test_own_target_and_scene_of_the_docs_appear(tmp_path):
+    for name in ("rig.toml", "yard.xml"):
+        (tmp_path / name).write_text(file_of("targets-and-scenes.md", name))
+    (tmp_path / "dog.obj").write_text(BOX)
+    world = SimWorld(load_config(tmp_path / "rig.toml"), rendered=())
+    truth = world.truth()
+    assert not 0 <= truth.center_px("dog", "fixed", 4.0)[0] < 640  # while the background is learnt
+    assert truth.silhouette("dog", "fixed", 9.0).visible == 1.0
+    world.close()
