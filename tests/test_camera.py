@@ -145,8 +145,7 @@ def test_a_spline_through_eight_stops_follows_a_smooth_lens():
 
 def test_the_nominal_focal_length_is_the_inverse_of_the_true_one_within_the_stops_and_beyond():
     lens = ZoomLens(
-        (700.0, 1500.0, 3000.0, 8000.0),
-        tuple(replace(ZOOM, focal_px=(f, f)) for f in (730.0, 1450.0, 3200.0, 7900.0)),
+        (700.0, 1500.0, 3000.0, 8000.0), tuple(replace(ZOOM, focal_px=(f, f)) for f in (730.0, 1450.0, 3200.0, 7900.0))
     )
     for nominal in (300.0, 700.0, 705.0, 1500.0, 2222.0, 7999.0, 8000.0, 12000.0):
         assert lens.nominal_for(lens.at(nominal).focal_px[0]) == pytest.approx(nominal, rel=1e-13)

@@ -5,16 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cotarget.drawing import (
-    SIZE_KNOWN_S,
-    TargetStages,
-    aim_error_figure,
-    captioned,
-    draw_box,
-    side_by_side,
-    write_text,
-)
-from cotarget.metrics import Row
+from cotarget.drawing import SIZE_KNOWN_S, TargetStages, draw_box, side_by_side
 from cotarget.rig import Frame
 from tests.support.steps import PICTURE, step
 
@@ -97,22 +88,6 @@ def test_the_label_of_a_box_at_the_border_is_in_the_image(at):
     assert shown[1] == pytest.approx(shown[0], rel=0.1)
 
 
-@pytest.mark.parametrize("grey", [0, 60, 128, 200, 255])
-def test_a_text_can_be_read_on_any_background(grey):
-    image = np.full((60, 200, 3), grey, np.uint8)
-    write_text(image, "bird", (10, 40))
-    assert np.abs(image.astype(int) - grey).max() >= VISIBLE
-
-
-@pytest.mark.parametrize("width", [320, 640, 1920])
-def test_a_caption_fits_below_its_image(width):
-    text = "close-up   pan -123.45   tilt -12.34 deg   focal length 12345 px   and more than was ever there"
-    image = captioned(np.zeros((240, width, 3), np.uint8), text)
-    strip = image[240:].min(axis=2)
-    assert (strip[:, -5:] > 200).all()
-    assert (strip < 100).any()
-
-
 @pytest.mark.parametrize(
     ("fixed", "zoom"), [((320, 240), (320, 240)), ((640, 480), (320, 240)), ((320, 240), (800, 600))]
 )
@@ -145,20 +120,3 @@ def test_a_film_shows_the_reason_at_the_bottom_of_the_fixed_cameras_image():
     assert 440 < short.min() < short.max() < 480
     assert long.min() < short.min() - 10
     assert long.max() < 480
-
-
-def row(t, focal_px):
-    """A frame with everything at its middle."""
-    numbers = {f.name: 0.0 if f.type is float else 0 for f in dataclasses.fields(Row)}
-    return Row(**numbers | {"t_s": t, "width_px": 64, "height_px": 48, "focal_px": focal_px, "wanted_px": 9.0})
-
-
-@pytest.mark.parametrize("names", [["book"], ["book", "person", "bird"]])
-def test_the_legend_of_the_aim_error_lies_on_no_curve(names):
-    figure = aim_error_figure({name: [row(0.1 * i, 700.0 + 90 * i) for i in range(9)] for name in names})
-    figure.canvas.draw()
-    (legend,) = figure.legends
-    assert len(figure.axes) == 2 * len(names)
-    for ax in figure.axes:
-        assert ax.get_legend() is None
-        assert not legend.get_window_extent().overlaps(ax.get_window_extent())

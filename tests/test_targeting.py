@@ -14,18 +14,9 @@ from cotarget.geometry import RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import CameraSpec, HeadSpec, RigSpec, ZoomSpec
 from cotarget.rig_geometry import FixedCamera, ZoomHead
-from cotarget.targeting import (
-    METHODS,
-    Aim,
-    Reach,
-    WantedSize,
-    aim,
-    depth_of,
-    error_budget,
-    point_at,
-    target_implausibility,
-)
+from cotarget.targeting import METHODS, Reach, WantedSize, aim, depth_of, error_budget, point_at, target_implausibility
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
+from tests.support.moving_targets import calibration_of
 from tests.support.rigs import with_zoom_head
 
 # The solver accepts a miss of 1e-11 rad, which is 1e-7 px at the longest focal length of 8000 px.
@@ -65,18 +56,6 @@ def random_truth(rng, real_head):
     lens = replace(lens, distortion=(-0.1, 0.02, 0.001, -0.001, 0.0))
     dz, eps = (rng.uniform(-0.01, 0.01), np.radians(rng.uniform(-0.5, 0.5))) if real_head else (0.0, 0.0)
     return Truth(zoom=lens, gamma=gamma, hand=hand, dz=dz, eps=eps)
-
-
-def calibration_of(truth):
-    def intrinsics(lens):
-        return Intrinsics(SIZE, (lens.fx, lens.fy), (lens.cx, lens.cy), lens.distortion)
-
-    return Calibration(
-        fixed=FixedCamera(intrinsics(truth.fixed)),
-        zoom_head=ZoomHead(
-            ZoomLens((667.0,), (intrinsics(truth.zoom),)), truth.gamma, truth.hand, HeadGeometry(truth.dz, truth.eps)
-        ),
-    )
 
 
 def seen_by_zoom(truth, found, x_fixed):
@@ -274,17 +253,11 @@ def test_a_pixel_is_not_aimed_at_by_a_calibration_in_millimetres_unless_insisted
     assert aim(apart, pixel=(400, 100), depth=9.0, insist=True).range > 300
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        {},
-        {"pixel": (400, 100)},
-        {"pixel": 3, "depth": 9.0},
-        {"pixel": (900, 100), "depth": 9.0},
-        {"pixel": (400, 100), "depth": 9.0, "x_fixed": np.array([0.0, 0.0, 9.0])},
-        {"pixel": (400, 100), "depth": 9.0, "method": "foo"},
-    ],
-)
+@pytest.mark.parametrize("given", [
+    {}, {"pixel": (400, 100)}, {"pixel": 3, "depth": 9.0}, {"pixel": (900, 100), "depth": 9.0},
+    {"pixel": (400, 100), "depth": 9.0, "x_fixed": np.array([0.0, 0.0, 9.0])},
+    {"pixel": (400, 100), "depth": 9.0, "method": "foo"},
+])  # fmt: skip
 def test_a_target_given_in_no_way_or_in_two_is_refused(given):
     with pytest.raises(ConfigError):
         aim(HOME, **given)
@@ -324,9 +297,3 @@ BOOK, PERSON, BIRD = (DEFAULT_TARGETS[name] for name in ("book", "person", "bird
 def test_target_that_is_none_or_that_no_lens_shows_is_implausible(target, name, rig, key):
     found = target_implausibility(target, HOME, rig, name)
     assert found.startswith(f"{key}: ") if key else not found
-
-
-def test_an_aim_prints_in_degrees():
-    found = Aim(math.radians(-12.345), math.radians(3.0), 1834.2, 1800.0, False, np.array([1.0, 2.0, 9.0]), 9.4)
-    assert str(found) == "pan -12.35 degrees, tilt 3.00 degrees, focal length 1834 px, depth 9.00 m"
-    assert "1834 px, the lens's limit, depth" in str(replace(found, limited=True))

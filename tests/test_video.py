@@ -157,21 +157,6 @@ def test_a_whole_film_has_no_shortfall(tmp_path, name):
             assert film.shortfall == ""
 
 
-def test_a_sound_track_longer_than_the_pictures_is_no_shortfall(tmp_path):
-    with av.open(str(tmp_path / "a.mkv"), "w") as out:
-        pictures, sound = out.add_stream("mjpeg", rate=25), out.add_stream("pcm_s16le", rate=8000)
-        pictures.width, pictures.height, pictures.pix_fmt = 64, 48, "yuvj420p"
-        for _ in range(25):
-            out.mux(pictures.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="bgr24")))
-        for _ in range(5):
-            block = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
-            block.sample_rate = 8000
-            out.mux(sound.encode(block))
-    with Film(tmp_path / "a.mkv") as film:
-        assert len(list(film)) == 25
-        assert film.shortfall == ""
-
-
 def damaged(whole, path, packets):
     """Copy a film, with these packets of it overwritten by zeros."""
     with av.open(str(whole)) as film:
@@ -255,28 +240,6 @@ def test_a_film_whose_time_jumps_and_stays_there_keeps_its_gap(tmp_path, caplog,
     with Film(tmp_path / "a.mkv") as film:
         np.testing.assert_allclose([frame.t for frame in film], times, atol=1e-3)
     assert not caplog.records
-
-
-@pytest.mark.parametrize("codec", ["mpeg4", "mjpeg"])
-def test_an_avi_with_empty_chunks_has_no_shortfall(tmp_path, codec):
-    """Where none comes a chunk is empty, and counts as a frame of those that the file says it has."""
-    other_film(tmp_path / "a.avi", codec, empty_from=20)
-    with Film(tmp_path / "a.avi") as film:
-        times = [frame.t for frame in film]
-    assert film.shortfall == ""
-    assert times == pytest.approx([i / RATE for i in range(60) if i < 20 or i % 10 == 0], abs=1e-3)
-
-
-def test_damage_and_an_early_end_are_both_reported(tmp_path):
-    other_film(tmp_path / "whole.avi", "mjpeg")
-    damaged(tmp_path / "whole.avi", tmp_path / "a.avi", [5])
-    data = (tmp_path / "a.avi").read_bytes()
-    (tmp_path / "a.avi").write_bytes(data[: len(data) * 6 // 10])
-    with Film(tmp_path / "a.avi") as film:
-        assert len(list(film)) > 20
-    damage, end = film.shortfall.split("; ")
-    assert damage.startswith("1 packet from frame 5 on could not be decoded")
-    assert end.startswith("the film says that it lasts 2.4 s, and ends at 1.")
 
 
 def test_detect_continues_after_damage_and_counts_labels_beyond_the_end(tmp_path, capsys):
