@@ -1,4 +1,4 @@
-"""Captures kept out of the fit: consistent where the model is exact, a warning where it is not."""
+"""Captures kept out of the fit, and the accuracy that is predicted for a session: against views really taken."""
 
 from dataclasses import replace
 
@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration import Calibration
-from cotarget.calibration.uncertainty import cross_validate, model_of
-from experiments.calibration.synthetic.rig import NOMINAL_PX, Lens, Truth, other_rig, truth_of
-from experiments.calibration.synthetic.views import Placing
-from tests.support.synthetic_calibration import NOISE_PX, POINTS, calibrated, drawn, drawn_at_stops, fitted
+from cotarget.calibration import Calibration, predicted_pointing
+from cotarget.calibration.planning import ACCURACY_GRID, BORDER, DEPTHS_SQUARES, planned_views, predict_accuracy
+from cotarget.calibration.uncertainty import covariance_of, cross_validate, model_of
+from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Truth, other_rig, truth_of
+from experiments.calibration.synthetic.views import Placing, synthetic_views
+from tests.support.synthetic_calibration import BOARD, NOISE_PX, POINTS, calibrated, drawn, drawn_at_stops, fitted
 from tests.support.synthetic_rig import fourfold
 
 RIGS = (Truth(), other_rig())
@@ -128,3 +129,67 @@ def test_undetermined_folds_give_no_held_out_check():
     start = model_of(calibrated(views, sizes=dict.fromkeys(("fixed", "zoom"), (640 * finer, 480 * finer))))
     again = cross_validate(fitted(start, views), POINTS, None, folds=5)
     assert again.predicted_px == pytest.approx(finer * predicted_px, rel=SAME_FIT)
+
+
+INVERTED = 1e-6  # relative: normal matrices of ten orders of magnitude, inverted in two ways
+
+
+@pytest.fixture(scope="module")
+def views():
+    return drawn(Truth(), 0, BOARDS)
+
+
+@pytest.fixture(scope="module")
+def start(views):
+    return model_of(calibrated(views))
+
+
+@pytest.fixture(scope="module")
+def found(views, start):
+    return fitted(start, views)
+
+
+@pytest.fixture(scope="module")
+def predicted(found):
+    return predict_accuracy(found, BOARD.square)
+
+
+def test_predicted_accuracy_is_that_of_the_calibration(found, predicted):
+    model = found.model
+    calibration = Calibration(model.fixed, model.zoom_head, covariance=covariance_of(found))
+    across, down = (np.linspace(BORDER, 1 - BORDER, count) for count in ACCURACY_GRID)
+    pixels = np.array([(u, v) for u in across for v in down]) * (np.array(SIZE) - 1)
+    errors = [predicted_pointing(calibration, pixels, depth * BOARD.square) for depth in DEPTHS_SQUARES]
+    assert predicted.error() == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=INVERTED)
+
+
+# Corners of 16 placements determine their noise to 1 %, and where the fit ends up moves the prediction by a few more.
+REAL_TOLERANCE = 0.1
+
+
+def test_predicted_accuracy_of_planned_views_is_reached(start, found, predicted):
+    """Really taken twice, with other noise; and one placement more, really taken."""
+    exact, rng = drawn(Truth(), 0, BOARDS, noise_px=0.0), np.random.default_rng(1)
+    more = [
+        replace(v, corners_px=v.corners_px + rng.normal(0, NOISE_PX, v.corners_px.shape), board=v.board + BOARDS)
+        for v in exact
+    ]
+    twice = predict_accuracy(fitted(start, [*found.views, *more]), BOARD.square)
+    assert twice.error() == pytest.approx(predicted.error() / np.sqrt(2), rel=REAL_TOLERANCE)
+    number = BOARDS - 1
+    fewer = predict_accuracy(fitted(start, [v for v in found.views if v.board != number]), BOARD.square)
+    turns = [(v.pan, v.tilt) for v in found.views if v.board == number and v.camera == "zoom"]
+    planned = planned_views(number, turns, len(POINTS))
+    promised = fewer.error(fewer.worth(planned, {number: found.model.boards[number]}, POINTS))
+    assert promised == pytest.approx(predicted.error(), rel=REAL_TOLERANCE)
+
+
+HOPELESS = np.radians(10.0)
+
+
+def test_undetermined_rig_has_a_large_predicted_error(start, predicted):
+    assert replace(predicted, normal=np.zeros_like(predicted.normal)).error() == np.inf
+    only_pan = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=BOARDS, tilt_range=0.0)
+    assert predict_accuracy(fitted(start, only_pan), BOARD.square).error() > HOPELESS
+    nothing_left = fitted(start, drawn(Truth(), 0, boards=3))
+    assert predict_accuracy(replace(nothing_left, variance=None), BOARD.square) is None

@@ -1,5 +1,6 @@
-"""Results of the commands: JSON on stdout, tables, films and calibrations, and the lines of `config`."""
+"""Results of the commands: JSON on stdout, tables, films, calibrations, lines of `config`, and the selected target."""
 
+import argparse
 import json
 import math
 import os
@@ -9,6 +10,7 @@ import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,10 +19,14 @@ import pytest
 import cotarget
 from cotarget.calibration import Options
 from cotarget.cli.main import main
+from cotarget.cli.pipeline_run import Selection, add_selection
 from cotarget.config import BoardConfig, HardwareConfig, RigConfig, parse_config
+from cotarget.control.selection import Candidate
 from cotarget.drivers.rig import devices
 from cotarget.errors import CalibrationError
 from cotarget.geometry import pose
+from cotarget.rig import PanTiltLimits
+from cotarget.tracking.track import Track
 from experiments.calibration.synthetic.rig import Truth, undistorted
 from experiments.engine import LINEAR_ALGEBRA
 from tests.support.commands import OLD, bird_film, call, refused, true_calibration, write_index
@@ -286,3 +292,53 @@ def test_every_key_that_is_taken_in_has_its_default(capsys):
     assert {name: device.settings for name, device in devices(found.hardware).items()} == {
         name: device.settings for name, device in devices(usual.hardware).items()
     }
+
+
+SIZE = (640, 480)
+LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)
+
+
+def chosen(*arguments, recorded=None):
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    add_selection(parser)
+    return Selection(parser.parse_args(arguments), SIZE, recorded)
+
+
+def track(number, center=(1, 1), confirmed=True):
+    center, size = np.array(center, float), np.array([20.0, 30.0])
+    return Track(number, 0.0, confirmed, 0, center, np.zeros(2), size, 30.0, np.eye(4), 1.0, None)
+
+
+@pytest.mark.parametrize(("arguments", "recorded", "number"), [
+    ((), None, 2), (("--policy", "first-come"), None, 2), (("--policy", "nearest-deadline"), None, 5),
+    (("--policy", "most-served"), None, 2), (("--click", "325", "210"), None, 3),
+    (("--click", "325", "400"), None, None), (("--track", "5"), None, 5), (("--track", "4"), None, None),
+    ((), {"track": 5}, 5), ((), {"click": [325, 210.0]}, 3), ((), {"policy": "nearest-deadline"}, 5),
+    (("--track", "3"), {"track": 5}, 3),
+])  # fmt: skip
+def test_options_or_recording_select_the_target(arguments, recorded, number):
+    """Of three targets: one at the left stays, one in the middle leaves in 9 s, and one at the right in 5 s."""
+    places = {2: (100, 200), 3: (320, 200), 5: (600, 200)}
+    seen_s = (0.0, 2.0, 2.0) if "most-served" in arguments else (0.0, 0.0, 0.0)
+    candidates = [
+        Candidate(track(number, at), lambda _, at=at: np.array([(at[0] - 320) / 686, 0.0]), leaves, seen)
+        for (number, at), leaves, seen in zip(places.items(), (np.inf, 9.0, 5.0), seen_s, strict=True)
+    ]
+    selector = chosen(*arguments, recorded=recorded).selector
+    selector.start(SIZE)
+    assert selector.select(candidates, np.zeros(2), LIMITS) == number
+
+
+@pytest.mark.parametrize(("arguments", "recorded", "named"), [
+    (("--track", "4"), None, "--track"), (("--click", "3", "4"), None, "--click"),
+    ((), {"track": 4}, "the recorded track"), ((), {"click": [3.0, 4.0]}, "the recorded click"), ((), None, None),
+])  # fmt: skip
+def test_unmatched_selection_is_reported_with_the_tracks_seen(arguments, recorded, named):
+    selection = chosen(*arguments, recorded=recorded)
+    assert selection.warning == ""  # nothing was there at all
+    selection.see(SimpleNamespace(target=None, tracks=[track(2), track(3, confirmed=False)]))
+    if named is not None:
+        assert selection.warning.startswith(f"{named}: ")
+        assert selection.warning.endswith(": 2")
+        selection.see(SimpleNamespace(target=track(4), tracks=[]))
+    assert selection.warning == ""

@@ -5,22 +5,12 @@ import pytest
 
 from cotarget.detection import Detections
 from cotarget.rig import Detection, Frame
-from cotarget.sim.targets.random_paths import GROUPED, group_paths, in_view
 from cotarget.sim.truth import Silhouette
-from experiments.following import detectors
 from experiments.following.detectors import SHAKES, STANDS, Watch
 from experiments.following.field_scenes import five_targets_config
 
 FRAMES, RATE = 100, 25.0
-HALF_SIZE = 0.5  # of a bird or, across, a person, and more [m]
 SIDE = np.array([20.0, 20.0])
-
-
-@pytest.mark.parametrize("kind", GROUPED)
-def test_the_first_of_five_is_in_view_before_the_shortest_run_ends(kind):
-    for seed in range(50):
-        ways = [np.array(way) for way in group_paths(kind, seed).values()]
-        assert any(in_view(way[way[:, 0] <= detectors.COME_S, 1:], HALF_SIZE).any() for way in ways), seed
 
 
 class Seer:

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from cotarget.track_metrics import Label, Tracked
+from cotarget.track_metrics import Label
 from experiments.following import sim_to_real
 from experiments.following.sim_to_real import appearance, fitted, stratum
 
 SHAPE = (120, 160)
-RATE = 30.0
 NOISE = 2.0
 # A fitted box covers whole pixels, and what is fainter than a fifth of the peak is none of it.
 FITTED_PX = 1.0
@@ -52,13 +51,6 @@ def test_a_label_that_is_too_large_is_fitted_to_the_blob_in_it():
     assert box.target == 5
     assert box.center_px == pytest.approx([105.5, 42.5], abs=FITTED_PX)
     assert box.size_px == pytest.approx([12, 6], abs=FITTED_PX)
-
-
-def test_boxes_are_counted_from_frame_30_on():
-    labels = {k: [label(50, 50, 10, 10)] for k in range(40)}
-    tracks = [Tracked(np.array([52.0, 50.0]), np.full(2, 10.0), k, k / RATE, 1) for k in range(35)]
-    rows = sim_to_real.scores(tracks, labels, {(k, 1): STRATUM for k in range(40)})
-    assert rows == [{"stratum": STRATUM, "boxes": 10, "found": 5, "error_px": 2.0}]
 
 
 def rows(kind, boxes, found, error_px, stratum=STRATUM):
