@@ -22,6 +22,7 @@ REFUSED = {
     "safety.stop_file": ["''", "'.'", "'run/..'", "1"],
     "safety.tilt_deg": ["30"],
     "safety.watchdog_s": ["0", "350", "inf", "0.04"],  # a frame comes each 0.04 s
+    "sim.effects.all": ["0"],
     "sim.fixed.center_px": ["[700, 239]"],
     "sim.fixed.distortion": ["[-0.5, 0, 0, 0, 0]"],  # folds back inside the image
     "sim.fixed.focal_px": ["[0, 1]"],
@@ -33,6 +34,8 @@ REFUSED = {
     "sim.paths": ["{ boook = [[0, 0, 0, 0], [1, 0, 0, 0]] }"],
     "sim.paths.bird": ["3", "[0, 0, 20, 5]", "[[1, 0, 0, 0], [1, 1, 0, 0]]"],
     "sim.T_head_zoom": ["3", "{ translation = 1, rotvec_deg = [0, 0, 0] }", "{ translation = [0, 0, 0] }"],
+    "sim.T_zoom0_fixed.rotvec_deg": ["[1e308, 1e308, 0]\nsim.T_zoom0_fixed.translation = [0, 0, 0]"],
+    "sim.T_zoom0_fixed.translation": ["[1e300, 0, 0]\nsim.T_zoom0_fixed.rotvec_deg = [0, 0, 0]"],
     "sim.targets": ["['cow']", "['dog']", "['bird', 'bird2', 'bird']", "'bird'"],
     "sim.zoom.center_drift_px": ["[[1, 2]]", "[1, 2]", "[[0], [480]]"],
     "sim.zoom.center_px": ["[326, -1]"],

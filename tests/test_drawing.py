@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cotarget.drawing import SIZE_KNOWN_S, TargetStages, draw_box, side_by_side
+from cotarget.drawing import SIZE_KNOWN_S, TargetStages, aim_error_figure, draw_box, side_by_side
+from cotarget.metrics import Row
 from cotarget.rig import Frame
 from tests.support.steps import PICTURE, step
 
@@ -120,3 +121,16 @@ def test_a_film_shows_the_reason_at_the_bottom_of_the_fixed_cameras_image():
     assert 440 < short.min() < short.max() < 480
     assert long.min() < short.min() - 10
     assert long.max() < 480
+
+
+def test_the_legend_of_the_aim_error_lies_on_no_curve():
+    numbers = {f.name: 0.0 if f.type is float else 0 for f in dataclasses.fields(Row)} | {
+        "width_px": 64,
+        "height_px": 48,
+    }
+    rows = [Row(**numbers | {"t_s": 0.1 * i, "focal_px": 700.0 + 90 * i, "wanted_px": 9.0}) for i in range(9)]
+    figure = aim_error_figure({"book": rows, "person": rows})
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert len(figure.axes) == 4
+    assert not any(legend.get_window_extent().overlaps(ax.get_window_extent()) for ax in figure.axes)

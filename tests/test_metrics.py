@@ -87,6 +87,7 @@ def test_never_acquired_never_there_and_a_single_row():
                   "size_ratio_median", "fragmentation_per_min"):  # fmt: skip
         assert getattr(never, field) is None, field
     assert never.range_m == 10.0
+    assert never.summary() == "never acquired in 50 frames"
     for rows in ([], run((100, {"in_wide": False})), run((40, {}))):
         assert score(rows) == Score(0, *[None] * 11)
     found = score(run((51, {})))
@@ -132,6 +133,7 @@ def test_medians():
         (20, {"u_px": CENTRE[0] + 64, "size_px": 176.0, "u_detected_px": math.nan}),
     ]
     found = score(run((50, {}), *thirds))
+    assert found.summary() == "acquired after 0.00 s, yield 1.00, offset 5.0% of the width, size ratio 1.00"
     assert found.tpo_px_median == pytest.approx(32.0)
     assert found.tpo_width_median == pytest.approx(0.05)
     assert found.tpo_deg_median == pytest.approx(math.degrees(math.atan(0.032)))

@@ -1,5 +1,6 @@
 """Tables of TOML and JSON against dataclasses: what is taken, and what is refused."""
 
+import datetime
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -67,6 +68,7 @@ def test_missing_keys_are_taken_from_the_base():
 # Values that a key refuses, and the key that the message begins with.
 REFUSED = [
     ("name", 3, "camera.name: "),
+    ("name", datetime.date(2026, 1, 2), "camera.name: "),
     ("rate_hz", "12", "camera.rate_hz: "),
     ("rate_hz", float("nan"), "camera.rate_hz: "),
     ("rate_hz", 0, "camera.rate_hz: "),

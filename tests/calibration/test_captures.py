@@ -157,7 +157,10 @@ def edited(tmp_path, edit):
 @pytest.mark.parametrize(("edit", "key"), [
     (lambda t: t.pop("schema"), "schema"), (lambda t: t.update(schema=99), "schema 99"),
     (lambda t: t["fixed"].pop("fx"), "fixed.fx: Field required"), (lambda t: t["fixed"].update(fx=-1), "fixed.fx"),
-    (lambda t: t["fixed"].update(fx=float("nan")), "NaN"), (lambda t: t["fixed"].update(k1=0.0), "'fixed.k1'"),
+    (lambda t: t["fixed"].update(fx=float("nan")), "NaN"), (lambda t: t["fixed"].update(cy=-1e308), "fixed.cy"),
+    (lambda t: t.update(covariance={"parameters": [], "matrix": []}), "covariance.parameters"),
+    (lambda t: t["covariance"]["matrix"][1].append(0.0), "covariance.matrix[1]"),
+    (lambda t: t["fixed"].update(k1=0.0), "'fixed.k1'"),
     (lambda t: t["zoom"].update(stops=[]), "zoom.stops"), (lambda t: t["zoom"]["stops"].reverse(), "nominal_px"),
     (lambda t: t["zoom"]["stops"][0].update(pupil=0.1), "zoom.stops[0].pupil"),
     (lambda t: t.update(T_zoom0_fixed=None), "T_zoom0_fixed"),

@@ -168,3 +168,21 @@ def test_page_is_served_to_this_machine_until_the_window_closes(world):
             gc.collect()
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(where, timeout=ANSWER_S)
+
+
+def test_overlay_uploads_only_new_pictures(world):
+    sent = []
+
+    def upload(texture, pixels, width, height, bytes_a_pixel):
+        sent.append((texture, pixels[:4], width, height))
+        assert len(pixels) == width * height * bytes_a_pixel
+        return texture or len(sent)
+
+    overlay = browser.Overlay(lambda *_: None)
+    overlay.viewer = SimpleNamespace(extra_geoms=[], upload_image=upload)
+    red, lines = np.full((480, 640, 3), (0, 0, 255), np.uint8), frusta_of(world.truth(), 5.0)
+    overlay.sight = Snapshot(5.0, "", {"fixed": red, "zoom": red}, lines)
+    for _ in range(2):
+        overlay.on_update(None)
+        assert len(overlay.viewer.extra_geoms) == sum(map(len, lines.values()))
+    assert sent == [(0, b"\xff\0\0\xff", browser.PICTURE_PX, 300)] * 2  # RGBA

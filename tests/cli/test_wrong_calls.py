@@ -81,6 +81,7 @@ CALLS = [
     (f"{OUT} --from index --kind charuco", FAILED, "--fixed, --zoom, --board and --square"),
     (f"{OUT} --from index --encoders --method sequential", FAILED, "--encoders", "--method joint"),
     (f"{OUT} --from index --captures x", FAILED, "--captures", "--rig"),
+    (f"{OUT} --from index --stops 3", FAILED, "--stops", "--rig"),
     (f"{SINGLE} --square 0.1 --board 9by6", USAGE, "--board", "9by6", "9x6"),
     (f"{SINGLE} --square 0.1 --board 7x6", FAILED, "single: ", "7x6"),
     (f"{SINGLE} --square 25 --board 9x6", FAILED, "--square", "0.025"),
@@ -93,6 +94,9 @@ CALLS = [
     ("board --out new.txt", FAILED, "new.txt", ".pdf, .png, .svg"),
     # aim
     (f"{AIM} --depth -3", USAGE, "--depth", "-3"),
+    (f"{AIM} --depth nan", USAGE, "--depth", "nan"),
+    (f"{AIM} --depth 1e300", FAILED, "1e+300"),
+    (f"{AIM} --depth 5 --fast", USAGE, "--fast"),
     (f"{AIM} --depth 9 --rig crow.toml --target crow", FAILED, "crow.toml: targets.crow.size", "cm are 1.8; --insist"),
     (f"{AIM} --depth 5 --rig typo.toml", FAILED, "typo.toml", "sim.scenery", "scene"),
     (f"{AIM} --depth 5 --rig replay.toml", FAILED, "replay.toml: backend is 'replay'"),
@@ -142,6 +146,7 @@ CALLS = [
     ("emulate --rig hw.toml --write new.toml", FAILED, "hw.toml: backend"),
     ("emulate --write new.toml --user root", FAILED, "--user", "COTARGET_PASSWORD"),
     ("emulate --write new.toml --fault silence", FAILED, "--fault", "'silence'", "fixed., head., zoom."),
+    ("emulate --write new.toml --head 65536", USAGE, "--head", "'65536'"),
     # what shows and inspects
     ("view --port 5", FAILED, "--port", "--browser"),
     ("view --calibration good.json", FAILED, "--calibration", "--target"),
