@@ -56,30 +56,6 @@ def test_the_truth_detector_clips_boxes_at_the_border():
             assert (d.center_px + d.size_px / 2 <= [639.5 + 1e-9, 479.5 + 1e-9]).all()
 
 
-def test_the_truth_finder_finds_a_target_within_the_gate_alone():
-    with (w := SimWorld(hold_config("book", 0), rendered=())).rig:
-        truth, calibration = w.truth(), true_calibration(w)
-        target = w.config.target("book")
-        x_world = truth.center("book", 1.0)
-        x_fixed = truth.T_world_camera("fixed", 1.0).inv().apply(x_world)
-        frame = Frame(np.zeros((480, 640, 3), np.uint8), 1.0)
-
-        def expected(x):
-            return Expected(x, 4.0 * np.eye(2), 0.0, 0.0, w.rig.zoom.focal_range[0])
-
-        at = truth.center_px("book", "zoom", 1.0)
-        seeds = [TruthFinder(calibration, target, truth, "book", seed) for seed in range(200)]
-        found = [each.find(frame, expected(x_fixed)) for each in seeds]
-        aside = np.std([each.center_px - at for each in found if each is not None], axis=0)
-        assert aside == pytest.approx(
-            [TruthFinder.SIGMA_PX] * 2, rel=0.2
-        )  # the standard deviation over 200 seeds is 5 %
-        assert sum(each is None for each in found) < 10  # of noise beyond the gate
-        assert seeds[0].find(frame, expected(x_fixed * [1.0, 1.1, 1.0])) is None
-        blind = TruthFinder(calibration, target, truth, "book", 0, missed=lambda t: True)
-        assert blind.find(frame, expected(x_fixed)) is None
-
-
 def test_the_random_numbers_of_a_time_do_not_depend_on_the_order_of_requests():
     def draw(at, t):
         rng = at(t)

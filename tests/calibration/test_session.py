@@ -21,10 +21,10 @@ from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig, parse_config
 from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import pose
-from cotarget.rig import Frame, PanTiltLimits, ZoomState
+from cotarget.rig import Frame, ZoomState
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
-from tests.support.rigs import rig_of
+from tests.support.rigs import alike, rig_of
 from tests.support.simulated_clock import SimClock
 from tests.support.synthetic_rig import PERIOD, SyntheticRig
 

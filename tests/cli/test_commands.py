@@ -25,11 +25,11 @@ from cotarget.control.selection import Candidate
 from cotarget.drivers.rig import devices
 from cotarget.errors import CalibrationError
 from cotarget.geometry import pose
-from cotarget.rig import PanTiltLimits
 from cotarget.tracking.track import Track
 from experiments.calibration.synthetic.rig import Truth, undistorted
 from experiments.engine import LINEAR_ALGEBRA
 from tests.support.commands import OLD, bird_film, call, refused, true_calibration, write_index
+from tests.support.rigs import alike
 from tests.support.synthetic_rig import draw, pixel_rays
 
 PIXEL = 1e-5  # an angle of 1e-11 rad, printed in full, at 692 px; and a text's rounding
@@ -295,7 +295,7 @@ def test_every_key_that_is_taken_in_has_its_default(capsys):
 
 
 SIZE = (640, 480)
-LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)
+LIMITS = alike((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)
 
 
 def chosen(*arguments, recorded=None):

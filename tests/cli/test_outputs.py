@@ -15,7 +15,7 @@ import pytest
 
 from cotarget.backends import OPENERS, describe
 from cotarget.calibration.model import Residuals
-from cotarget.cli.common import previous_kept, progress_bar
+from cotarget.cli.common import previous_kept
 from cotarget.config import RigConfig
 from cotarget.errors import CalibrationError, DeviceError
 from cotarget.files import write_atomically

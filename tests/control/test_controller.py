@@ -15,11 +15,10 @@ from cotarget.control.zoom import ZoomSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Appearance
 from cotarget.geometry import pose
-from cotarget.rig import PanTiltLimits
 from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import WantedSize
 from tests.support.formula_rig import FormulaRig
-from tests.support.rigs import rig_of
+from tests.support.rigs import alike, rig_of
 
 SIZE, CENTER = (640, 480), (319.5, 239.5)
 SHORTEST, LONGEST = 700.0, 7000.0

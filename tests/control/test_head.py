@@ -1,18 +1,19 @@
 """The head: its dead zone, and what it is taken to do, against the simulated unit's own axes."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
 from cotarget.control.head import HeadCommand, HeadController, HeadModel, HeadSettings, axis_at
-from cotarget.rig import PanTiltLimits, PanTiltState
+from cotarget.rig import PanTiltState
 from cotarget.sim.motion import Axis
 from tests.support.moving_targets import RATE
+from tests.support.rigs import alike, with_axes
 
 STEP = math.radians(0.0514286)
-LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), STEP)
+LIMITS = alike((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), STEP)
 
 
 FRAME = 1 / RATE
@@ -133,7 +134,9 @@ CLOSE = 3 * STEP  # what reports by whole steps leave open
 class Unit:
     """Two simulated axes, and the model beside them; reports are rounded to steps."""
 
-    axes: tuple = field(default_factory=lambda: tuple(Axis(LIMITS.speed, LIMITS.acceleration) for _ in range(2)))
+    axes: tuple = field(
+        default_factory=lambda: tuple(Axis(LIMITS.pan.speed, LIMITS.pan.acceleration) for _ in range(2))
+    )
     model: HeadModel = field(default_factory=lambda: HeadModel(LIMITS))
     rests: float = -math.inf
 
@@ -225,13 +228,13 @@ def test_a_head_that_arrives_early_is_not_sent_again(unit):
 @pytest.mark.parametrize("speed", [math.inf, 1.5, 0.2])
 @pytest.mark.parametrize("v", [0.0, 0.5, -0.8])
 def test_an_axis_moves_as_the_simulated_unit(goal, speed, v):
-    limit = min(speed, LIMITS.speed)
+    limit = min(speed, LIMITS.pan.speed)
     # For 100 s at v, it comes from as far as that takes it, less what speeding up cost, and passes 0 at time 0.
-    begin = -100 * v + v * abs(v) / (2 * LIMITS.acceleration)
-    axis = Axis(LIMITS.speed, LIMITS.acceleration, position=begin)
+    begin = -100 * v + v * abs(v) / (2 * LIMITS.pan.acceleration)
+    axis = Axis(LIMITS.pan.speed, LIMITS.pan.acceleration, position=begin)
     axis.command(-100.0, begin + 200 * v, abs(v) or None)
     axis.command(0.0, goal, limit)
     for seconds in (0.0, 0.03, 0.1, 0.3, 1.0, 4.0):
-        assert axis_at(seconds, 0.0, v, goal, limit, LIMITS.acceleration) == pytest.approx(
+        assert axis_at(seconds, 0.0, v, goal, limit, LIMITS.pan.acceleration) == pytest.approx(
             axis.motor(seconds), abs=1e-9
         )

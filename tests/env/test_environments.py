@@ -286,7 +286,7 @@ def test_an_action_stands_for_a_place_within_the_soft_limits(narrow):
         env.reset(seed=0)
         for _ in range(40):
             observation, *_ = env.step(np.array([side, side, 0.0], np.float32))
-        state, step = env.episode.rig.head.state(), env.episode.rig.head.limits.step
+        state, step = env.episode.rig.head.state(), env.episode.rig.head.limits.pan.step
         for angle, limits in ((state.pan, (-5.0, 5.0)), (state.tilt, (-2.0, 25.0))):
             end = math.radians(limits[side > 0])
             assert 0 <= side * (end - angle) < step  # the last step inside them

@@ -12,7 +12,8 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.demo import SCENES, sim_config
 from cotarget.estimation.correlation import correlate, resample, summit
-from cotarget.estimation.zoom_matching import CloseupFinder, Expected, look
+from cotarget.estimation.measurement_model import Pose
+from cotarget.estimation.zoom_matching import CloseupFinder, look
 from cotarget.evaluation import true_calibration
 from cotarget.geometry import pose
 from cotarget.rig import Detection, Frame

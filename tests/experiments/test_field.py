@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 import pytest
+from experiments.following.field_scenes import five_targets_config, hold_config
 from matplotlib.figure import Figure
 
 from cotarget.config import parse_config
 from cotarget.control.head import HeadSettings
 from cotarget.detection import Detections
 from cotarget.errors import ConfigError
-from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, true_calibration
+from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings
 from cotarget.rig import Frame
@@ -21,7 +22,6 @@ from cotarget.sim.targets.target import marker_of
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
 from experiments.following import delay, field, first_shot
-from experiments.following.field_scenes import five_targets_config, hold_config
 from experiments.following.first_shot import CAUSES, Shot, budget
 from experiments.following.single_ptz import TruthFinder
 from experiments.following.wide_view import Seen, WideView, open_on, record
