@@ -44,7 +44,7 @@ class StateHistory:
 
     def add(self, head: PanTiltState, lens: ZoomState) -> None:
         """Add the newest states of both devices; ignore a state that is no newer than the last one."""
-        _append(self._heads, (head.t, head.pan, head.tilt))
+        _append(self._heads, (head.t, head.pan, head.tilt, head.sigma))
         _append(self._lenses, (lens.t, math.log(lens.focal_px)))
 
     def interpolate(self, t: float) -> Pose | None:
@@ -54,9 +54,10 @@ class StateHistory:
         heads, lenses = _around(self._heads, t), _around(self._lenses, t)
         # Coefficients of the polynomial through the head's states, by powers of the time since t.
         powers = np.vander(heads[:, 0] - t, increasing=True)
-        (pan, tilt), *higher = np.linalg.solve(powers, heads[:, 1:]).tolist()
+        (pan, tilt), *higher = np.linalg.solve(powers, heads[:, 1:3]).tolist()
         speed = math.hypot(*higher[0]) if higher else 0.0
-        return Pose(pan, tilt, math.exp(float(np.interp(t, lenses[:, 0], lenses[:, 1]))), speed)
+        nominal_px = math.exp(float(np.interp(t, lenses[:, 0], lenses[:, 1])))
+        return Pose(pan, tilt, nominal_px, speed, float(heads[:, 3].max()))
 
 
 def _append(kept: "deque[tuple[float, ...]]", state: tuple[float, ...]) -> None:
@@ -183,7 +184,7 @@ class ZoomSearch:
             # Both cameras show the same point, but wings and limbs move it. With the registration's own error alone,
             # the filter would take their beats for motion of the target.
             sigma_px = np.hypot(found.sigma_px, found.body_sigma_px)
-            head_sigma = math.hypot(HEAD_SIGMA, pose.speed * self._settings.time_sigma_s)
+            head_sigma = math.hypot(HEAD_SIGMA, pose.sigma, pose.speed * self._settings.time_sigma_s)
             target.filter.add_zoom(
                 found.center_px, sigma_px, pose.pan, pose.tilt, pose.nominal_px, due.t, head_sigma=head_sigma
             )
@@ -255,9 +256,10 @@ class ZoomSearch:
             wider = replace(estimate, state_covariance=inflated(estimate.state_covariance, self._filter))
             searched = wider.appearance(pose.pan, pose.tilt, pose.nominal_px) or seen
         true = replace(pose, pan=pose.pan + estimate.bias[0], tilt=pose.tilt + estimate.bias[1])
-        covariance = searched.covariance + self._least_variance_px * np.eye(2)
+        head_covariance = np.diag(np.square(pose.sigma * seen.focal_px))
+        covariance = searched.covariance + self._least_variance_px * np.eye(2) + head_covariance
         found = self.finder.find(frame, estimate.x_fixed, covariance, true)
-        self._count_unfound(frame, found, seen, estimate)
+        self._count_unfound(frame, found, replace(seen, covariance=seen.covariance + head_covariance), estimate)
         return found
 
     def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:

@@ -38,12 +38,14 @@ class Pose:
         tilt: tilt as the head reports it [rad].
         nominal_px: nominal focal length, as the lens reports it [px].
         speed: speed of the head over both axes together [rad/s].
+        sigma: standard deviation that the head reports of either angle [rad].
     """
 
     pan: float
     tilt: float
     nominal_px: float
     speed: float = 0.0
+    sigma: float = 0.0
 
 
 @dataclass(frozen=True)

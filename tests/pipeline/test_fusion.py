@@ -88,9 +88,9 @@ def seen(fusion, tracks_at, frames):
     return (frames - 1) * FRAME_S
 
 
-def report(fusion, t, pan=0.0, nominal=ZOOMED):
+def report(fusion, t, pan=0.0, nominal=ZOOMED, sigma=0.0):
     """Head and lens report their state."""
-    fusion.search.states.add(PanTiltState(pan, 0.0, False, t), ZoomState(nominal, False, t))
+    fusion.search.states.add(PanTiltState(pan, 0.0, False, t, sigma), ZoomState(nominal, False, t))
 
 
 # ---------------------------------------------------------------- filters of tracks
@@ -308,17 +308,18 @@ def test_a_target_is_seen_well_inside_the_close_up_and_as_large_as_wanted(pan, n
 
 
 # ---------------------------------------------------------------- the followed target in the zoom image
-def followed(finder, x_fixed=X, wrong=1.0, frames=40, shake=0.0, **how):
+def followed(finder, x_fixed=X, wrong=1.0, frames=40, shake=0.0, sigma=0.0, **how):
     """Follow a standing book, whose box is `wrong` times too large, with a given finder.
 
-    The head points straight ahead at each frame, and `shake` [rad] to the left between two frames.
+    The head points straight ahead at each frame, and `shake` [rad] to the left between two frames; it reports a
+    standard deviation [rad].
     """
     fusion, found = Pair(BOOK, finder, followed=1, **how), []
     for i in range(frames):
         t = i * FRAME_S
         fusion.show(t, [track(1, box_at(*x_fixed, wrong=wrong), t)])
         report(fusion, t - FRAME_S / 2, pan=-shake)
-        report(fusion, t)
+        report(fusion, t, sigma=sigma)
         found.append(fusion.search.add_frame(Frame(IMAGE, t), t))
     return fusion, found, t
 
@@ -336,11 +337,15 @@ def test_the_zoom_image_triangulates_the_depth():
     assert finder.asked[-1][0][2] == pytest.approx(10.0, rel=DEPTH)
 
 
-@pytest.mark.parametrize(("body_sigma_px", "shake"), [(30.0, 0.0), (1.0, 0.05)], ids=["moving limbs", "moving head"])
-def test_an_uncertain_centre_in_the_zoom_image_moves_the_estimate_less(body_sigma_px, shake):
+@pytest.mark.parametrize(
+    ("body_sigma_px", "shake", "sigma"),
+    [(30.0, 0.0, 0.0), (1.0, 0.05, 0.0), (1.0, 0.0, 0.01)],
+    ids=["moving limbs", "moving head", "coarse reports"],
+)
+def test_an_uncertain_centre_in_the_zoom_image_moves_the_estimate_less(body_sigma_px, shake, sigma):
     off = np.add(X, (0.02, 0.0, 0.0))
     certain, _, t = followed(Finder(off), frames=10)
-    uncertain, _, _ = followed(Finder(off, body_sigma_px), frames=10, shake=shake)
+    uncertain, _, _ = followed(Finder(off, body_sigma_px), frames=10, shake=shake, sigma=sigma)
     assert uncertain.estimate(1, t).x_fixed[0] - X[0] < 0.7 * (certain.estimate(1, t).x_fixed[0] - X[0])
 
 
@@ -496,18 +501,18 @@ def apart(by, frames=60, missed=lambda i: 0):
     return fusion, found, fusion.warnings(t)
 
 
-@pytest.mark.parametrize("by", [0.08, 0.13, 0.29, 0.49, -0.13, -0.29, -0.49])
+@pytest.mark.parametrize("by", [0.08, 0.13, 0.29, 0.97, -0.13, -0.29, -0.97])
 def test_cameras_of_different_latencies_are_fused_at_equal_times(by):
     _, found, warnings = apart(by)
-    assert all(each is not None for each in found[15:])
-    assert np.diff([each.t for each in found[15:]]) == pytest.approx(FRAME_S)
+    assert all(each is not None for each in found[30:])
+    assert np.diff([each.t for each in found[30:]]) == pytest.approx(FRAME_S)
     assert warnings == []
 
 
-@pytest.mark.parametrize(("by", "later"), [(0.7, "fixed"), (-0.7, "zoom")])
+@pytest.mark.parametrize(("by", "later"), [(1.4, "fixed"), (-1.4, "zoom")])
 def test_cameras_too_far_apart_in_time_are_reported(by, later):
     warnings = apart(by)[2]
-    assert warnings == [f"the cameras are too far apart in time: the {later} one comes 0.70 s later"]
+    assert warnings == [f"the cameras are too far apart in time: the {later} one comes 1.40 s later"]
 
 
 def test_zoom_frames_without_a_fixed_frame_of_their_time_cause_no_warning():
