@@ -230,7 +230,7 @@ class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
         self._stream: av.VideoStream | None = None
         self._begin, self._last = 0.0, -TICKS_HZ
         try:
-            options = FRAGMENTS if path.suffix.lower() in FRAGMENTED else {}
+            options = {"flush_packets": "1"} | (FRAGMENTS if path.suffix.lower() in FRAGMENTED else {})
             self._container = av.open(_url(self._part.path), "w", options=options)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             with self._part.ending(keep=False):
@@ -293,8 +293,19 @@ class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
                 failure = failed
                 with contextlib.suppress(av.error.FFmpegError, OSError):
                     self._container.close()
+            if keep and failure is not None and not _can_be_played(self._part.path):
+                raise CotargetError(f"{self._path}: cannot be completed ({reason_of(failure)})")
         if error is None and failure is not None:
             raise CotargetError(f"{self._path}: is cut short ({reason_of(failure)}); holds what there was until then")
+
+
+def _can_be_played(path: Path) -> bool:
+    """Check whether a film has a frame that can be decoded."""
+    try:
+        with Film(path) as film:
+            return next(iter(film), None) is not None
+    except CotargetError:
+        return False
 
 
 def join_films(parts: Sequence[Path], path: Path) -> None:

@@ -119,10 +119,10 @@ def test_in_frame_and_good_closeup(change, in_frame, good):
 
 def test_target_point_offset():
     off = dataclasses.replace(GOOD, u_px=CENTRE[0] + 30, v_px=CENTRE[1] - 40)
-    assert off.tpo_px == pytest.approx(50.0)
+    assert off.closeup.tpo_px == pytest.approx(50.0)
     assert off.tpo_deg == pytest.approx(math.degrees(math.atan(0.05)))
     for lost in (AWAY, {"u_px": math.nan, "v_px": math.nan}):
-        assert dataclasses.replace(GOOD, **lost).tpo_px == pytest.approx(HALF_DIAGONAL)
+        assert dataclasses.replace(GOOD, **lost).closeup.tpo_px == pytest.approx(HALF_DIAGONAL)
 
 
 def test_medians():
