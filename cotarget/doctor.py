@@ -224,9 +224,15 @@ def _devices(config: "RigConfig", rig: Path) -> list[Finding]:
     from cotarget.drivers.rig import board_settings, devices
 
     found, presenter = devices(config.hardware), board_settings(config.hardware)
+    is_begun = any(getattr(config.hardware, device.role) for device in found.values())
     return [
         _position(config, found["head"].address, rig),
-        *(_ask(device.where, device.probe, device.address, rig) for device in found.values()),
+        *(
+            _ask(device.where, device.probe, device.address, rig)
+            if getattr(config.hardware, device.role) or not is_begun
+            else Finding(device.where, None, "has no table; following needs it")
+            for device in found.values()
+        ),
         _ask("hardware.board", lambda: board.probe(presenter), presenter.presenter, rig),
     ]
 
@@ -236,7 +242,7 @@ def _ask(name: str, ask: Callable[[], str | None], there: str, rig: Path) -> Fin
         said = ask()
         return Finding(name, None if said is None else True, said or "is not asked: its driver has no probe")
     except CotargetError as error:
-        return Finding(name, False, str(error), _fix(error, name, there, rig))
+        return Finding(name, False, str(error).removeprefix(f"{name}: "), _fix(error, name, there, rig))
 
 
 def _fix(error: CotargetError, name: str, there: str, rig: Path) -> str:

@@ -236,7 +236,7 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     home = rig.head.state()
     refuse_outside(home, rig.head.limits)
     _zoom_out(rig)
-    pan, tilt = home.pan, home.tilt
+    pan, tilt = rig.head.move(home.pan, home.tilt)  # to where it stands: its goal there, if its driver knows it
     low, high = rig.head.limits.pan.range
     way = WIGGLE if pan + WIGGLE <= high else -WIGGLE
     times: list[float] = []
@@ -262,6 +262,11 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     if len(times) < FEWEST:
         few = f"the zoom camera gave {len(times)} frames in {seconds:g} s; {FEWEST} are needed"
         raise StaleFrameError("; ".join(filter(None, (few, late))))
+    if np.ptp(pans) < abs(way) / 2:
+        raise CalibrationError(
+            f"the head was sent to and fro by {np.degrees(WIGGLE):.1f} degrees and moved by "
+            f"{np.degrees(np.ptp(pans)):.2f}; see that nothing is in its way"
+        )
     zoom = delay_between(np.array(times), np.array(shifts), reported, pans)
     if zoom.agreement < AGREEMENT:
         unmoved = (

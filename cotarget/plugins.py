@@ -10,6 +10,7 @@ import functools
 import importlib
 import importlib.util
 import sys
+import sysconfig
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Any, NamedTuple
 from cotarget.errors import ConfigError, CotargetError, DeviceError, choices
 
 FORM = "module:name"
+HERE = f"{Path(__file__).parent}/"
 LONGEST = 60  # a longer wrong answer is described by its type in messages [characters]
 
 
@@ -101,15 +103,22 @@ def calling(what: str) -> Iterator[None]:
 
 
 def place_of(error: Exception) -> str:
-    """Return file and line where an error was raised."""
+    """Return file and line where an error was raised; of a user's code those in it, though a library raised it."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}"
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_ours(frame.filename)]
+    frames = [frame for frame in frames if not _is_librarys(frame.filename)] or frames
     return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "?"
 
 
 def _is_ours(file: str) -> bool:
     return file == __file__ or file.startswith("<frozen") or "importlib" in file
+
+
+def _is_librarys(file: str) -> bool:
+    """Whether a file is of Python's library, of an installed package, or of this one."""
+    paths = sysconfig.get_paths()
+    return any(file.startswith(f"{paths[name]}/") for name in ("stdlib", "purelib", "platlib")) or file.startswith(HERE)
 
 
 class Answer(NamedTuple):

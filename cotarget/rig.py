@@ -95,6 +95,8 @@ def to_step(angle: float, step: float) -> float:
     return round(angle / step) * step if step else angle
 
 
+# Time to come to rest if the acceleration is unknown [s]: after a stop, domes were seen to turn on for up to 1.1 s.
+USUAL_BRAKING_S = 2.0
 STEP_ROUNDING = 1e-9  # in steps; keeps a limit of whole steps whole after its conversion from degrees
 
 
@@ -128,8 +130,10 @@ class AxisLimits:
 
     @property
     def braking_s(self) -> float:
-        """Longest time to come to rest [s]; 0 if the acceleration is unknown."""
-        return 0.0 if math.isinf(self.assumed_acceleration) else self.speed / self.assumed_acceleration
+        """Time to come to rest from the highest speed [s]; a usual one if the acceleration is unknown."""
+        if math.isinf(self.speed):
+            return 0.0
+        return USUAL_BRAKING_S if self.acceleration is None else self.speed / self.acceleration
 
     def travel_s(self, way: float) -> float:
         """Travel time from rest to rest over an angle [rad] at full speed [s]."""
@@ -215,7 +219,7 @@ def refuse_outside(state: PanTiltState, limits: PanTiltLimits, axes: Sequence[st
             raise DeviceError(
                 f"the head stands at {name} {math.degrees(angle):.1f} degrees, beyond the limits of "
                 f"{low:.1f} to {high:.1f}, and would move inside; if it may, do so first "
-                f"by cotarget point --{name}-deg {min(max(math.degrees(angle), low), high):.1f}"
+                f"by cotarget point --rig RIG --{name}-deg {min(max(math.degrees(angle), low), high):.1f}"
             )
 
 

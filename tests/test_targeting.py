@@ -212,7 +212,7 @@ SIGMA = 1 / math.sqrt(12)
 
 def test_error_budget_straight_ahead():
     """No offset: steps of both axes, the pixel as an angle in u and in v, and a depth that does not matter."""
-    reach, pixel = replace(ANYWHERE, step=math.radians(0.05)), np.array([319.5, 239.5])
+    reach, pixel = replace(ANYWHERE, steps=(math.radians(0.05),) * 2), np.array([319.5, 239.5])
     found = aim(HOME, point_at(HOME, pixel, 10.0), reach)
     budget = error_budget(HOME, pixel, found, reach, size_px=16.0)
     assert set(budget) == {"steps", "pixel", "size", "total"}
@@ -241,7 +241,7 @@ def test_error_budget_off_to_the_side():
     )
     assert "size" not in error_budget(calibration, pixel, found, ANYWHERE)
     high = replace(aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE), tilt=math.radians(60))
-    steps = error_budget(HOME, pixel, high, replace(ANYWHERE, step=0.001))["steps"]
+    steps = error_budget(HOME, pixel, high, replace(ANYWHERE, steps=(0.001, 0.001)))["steps"]
     assert steps == pytest.approx(0.001 * SIGMA * math.sqrt(1 + 0.25), rel=RELATIVE)
 
 

@@ -225,7 +225,7 @@ def focal_px_of(focal_mm: float, pitch_mm: float | None, bounds_px: tuple[float,
         ConfigError: the pixel's size is unknown, or the lens does not have that focal length.
     """
     if pitch_mm is None:
-        raise ConfigError("--focal-mm: needs the size of a pixel; give pitch_mm in the zoom camera's table of rig.toml")
+        raise ConfigError("--focal-mm: the size of a pixel is not known; `cotarget point` has --focal-px")
     check_within("--focal-mm", focal_mm, (bounds_px[0] * pitch_mm, bounds_px[1] * pitch_mm), "the lens's {} mm")
     return focal_mm / pitch_mm
 

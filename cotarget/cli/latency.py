@@ -3,6 +3,7 @@
 import argparse
 import math
 import sys
+from collections.abc import Callable
 
 from cotarget.cli.common import add_file, add_insist, add_rig, check_board_size, load_plausible, open_named, print_json
 from cotarget.errors import CalibrationError, ConfigError
@@ -36,30 +37,48 @@ def run(options: argparse.Namespace) -> None:
         calibration.zoom_head.hand_eye()
         check_board_size(options.rig, config)
     where = "sim" if config.backend == "sim" else "hardware"
+    one = bool(where == "hardware" and config.hardware.ptz)
+    head_table, zoom_table = (f"{where}.{'ptz' if one else name}" for name in ("head", "zoom"))
+    found: dict[str, float | None] = {}
+    agreement: dict[str, float] = {}
+    failed: list[str] = []
+
+    def keep(name: str, measure: Callable[[], float]) -> None:
+        """Keep a measured value for rig.toml; a failure is printed at the end, because the others are as good."""
+        try:
+            found[name] = _plausible(name, measure(), head.late)
+        except CalibrationError as error:
+            found[name] = None
+            failed.append(str(error) if name in str(error) else f"{name}: {error}")
+
     with open_named(options.rig, config, partial=True) as rig:
         head = measure_head(rig)
-        found = {
-            f"{where}.zoom.latency_s": rig.spec.zoom.latency_s + head.zoom.seconds,
-            f"{where}.head.command_delay_s": head.command,
-        }
-        agreement = {"zoom": head.zoom.agreement}
-        if config.backend == "hardware":  # a simulated lens has the head's command delay
-            found["hardware.zoom.command_delay_s"] = measure_lens(rig, head.zoom.seconds)
+        agreement["zoom"] = head.zoom.agreement
+        keep(f"{zoom_table}.latency_s", lambda: rig.spec.zoom.latency_s + head.zoom.seconds)
+        keep(f"{head_table}.command_delay_s", lambda: head.command)
+        if where == "hardware" and not one:  # otherwise the lens has the head's command delay
+            keep("hardware.zoom.command_delay_s", lambda: measure_lens(rig, head.zoom.seconds))
         if calibration is not None:
             fixed = measure_fixed(rig, calibration, config.board)
-            # Relative to the zoom camera, whose frame times contain the error found above.
-            found[f"{where}.fixed.latency_s"] = rig.spec.fixed.latency_s + fixed.seconds + head.zoom.seconds
             agreement["fixed"] = fixed.agreement
+            # Relative to the zoom camera, whose frame times contain the error found above.
+            found_s = rig.spec.fixed.latency_s + fixed.seconds + head.zoom.seconds
+            keep(f"{where}.fixed.latency_s", lambda: found_s)
     if calibration is None:
         print("the fixed camera's latency needs --calibration, to look at a board with both cameras", file=sys.stderr)
-    rounded = {name: None if math.isnan(value) else _plausible(name, value, head.late) for name, value in found.items()}
     if head.late:
         print(f"cotarget latency: the values are doubtful: {head.late}", file=sys.stderr)
-    print_json({"measured": rounded, "agreement": agreement})
+    print_json({"measured": found, "agreement": agreement})
+    if failed:
+        raise CalibrationError("; ".join(failed))
 
 
 def _plausible(name: str, seconds: float, late: str) -> float:
-    """Round a latency for rig.toml; refuse one that is negative beyond the measurement's accuracy."""
+    """Round a latency for rig.toml; refuse one that was not found, or is negative beyond the measurement's accuracy."""
+    if math.isnan(seconds):
+        raise CalibrationError(
+            f"{name}: the head reports too seldom while it speeds up; state its acceleration in its driver"
+        )
     if seconds < -ACCURACY_S:
         why = late or "see that the picture has structure and that nothing else moves in it, and measure again"
         raise CalibrationError(f"{name}: {1000 * seconds:.0f} ms was measured, which is implausible: {why}")

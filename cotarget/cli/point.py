@@ -30,7 +30,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_rig(parser)
     parser.add_argument("--pan-deg", type=number, metavar="A", help="pan, positive to the right (unchanged)")
     parser.add_argument("--tilt-deg", type=number, metavar="A", help="tilt, positive up (unchanged)")
-    parser.add_argument("--focal-mm", type=positive, metavar="F", help="focal length [mm] (unchanged)")
+    lens = parser.add_mutually_exclusive_group()
+    lens.add_argument("--focal-mm", type=positive, metavar="F", help="focal length [mm] (unchanged)")
+    lens.add_argument("--focal-px", type=positive, metavar="F", help="nominal focal length [px] (unchanged)")
     about = "write fixed.png and zoom.png to this folder; earlier ones are kept under other names"
     add_file(parser, "--pictures", about, "DIR")
 
@@ -52,8 +54,14 @@ def run(options: argparse.Namespace) -> None:
     with open_named(options.rig, config, partial=True) as rig:
         if moves := any(angle is not None for angle in asked.values()):
             goal = _goal(rig, asked)
-        if options.focal_mm is not None:
-            rig.zoom.zoom(focal_px_of(options.focal_mm, rig.spec.zoom.pitch_mm, rig.zoom.focal_range))
+        if options.focal_mm is not None or options.focal_px is not None:
+            rig.zoom.state()  # there is a lens
+            focal_px = options.focal_px
+            if focal_px is None:
+                focal_px = focal_px_of(options.focal_mm, rig.spec.zoom.pitch_mm, rig.zoom.focal_range)
+            else:
+                check_within("--focal-px", focal_px, rig.zoom.focal_range, "the lens's {} px")
+            rig.zoom.zoom(focal_px)
         if moves:
             now = rig.head.state()
             goal = rig.head.move(*goal, wait=True)

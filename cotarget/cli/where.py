@@ -36,5 +36,6 @@ def position(rig: "Rig", *, is_moving: bool = False) -> dict[str, Any]:
         "pan_deg": head and math.degrees(head.pan),
         "tilt_deg": head and math.degrees(head.tilt),
         "focal_mm": None if lens is None or pitch_mm is None else lens.focal_px * pitch_mm,
+        "focal_px": lens and lens.focal_px,
     }
     return said | ({"moving": any(each is not None and each.moving for each in (head, lens))} if is_moving else {})

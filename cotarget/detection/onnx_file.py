@@ -16,6 +16,7 @@ from cotarget.errors import ConfigError, install_extra
 from cotarget.geometry import Array
 
 FLOAT32 = 1  # in onnx.proto
+LONGEST_VARINT = 10  # [bytes]
 
 Outputs = Mapping[str, Array]
 Run = Callable[[Array], Outputs]
@@ -216,10 +217,10 @@ def _fields(message: memoryview, number: int) -> Iterator[Any]:
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
     """Read an integer of seven bits a byte; return it, and where the next field begins."""
-    value = shift = 0
-    while True:
-        byte = message[at]
-        value |= (byte & 0x7F) << shift
-        at, shift = at + 1, shift + 7
+    value = 0
+    for i in range(LONGEST_VARINT):  # a damaged file has one without end
+        byte = message[at + i]
+        value |= (byte & 0x7F) << 7 * i
         if byte < 0x80:
-            return value, at
+            return value, at + i + 1
+    raise ValueError(at)

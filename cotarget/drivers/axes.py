@@ -8,10 +8,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from cotarget.rig import AxisLimits
+from cotarget.errors import DeviceError
+from cotarget.rig import USUAL_BRAKING_S, AxisLimits
 
-# Time to come to rest if the acceleration is unknown [s]: after a stop, domes were seen to turn on for up to 1.1 s.
-USUAL_BRAKING_S = 2.0
+AXES = ("pan", "tilt", "the lens")
 ROUNDING = 1e-9  # of the range of an axis without steps: positions nearer than that are the same
 
 
@@ -27,8 +27,8 @@ class AxisFacts:
         slowest: speed [1/s].
         acceleration: [1/s^2]; None if unknown.
         step: to which positions are rounded, such as 1 where they are whole; 0 for a continuous axis.
-        slack: an axis that stands this far from its goal has arrived, and one that trembles by no more stands: 0 for a
-            stepper, the control error of a servo. It covers the errors of the reported position.
+        slack: largest distance of the reported position from the goal where the axis has arrived: 0 for a stepper, the
+            control error of a servo with its trembling, or the error of the report.
         still_s: an axis stands when it has stayed in one place for this time, unless the unit says whether it moves
             [s]; longer than the slowest speed takes for a step.
         loses_steps: whether the unit counts from a wrong position after the axis was blocked, as a stepper without an
@@ -121,12 +121,22 @@ class AxisTrack:
         return self.polls[-1]
 
     def add(self, poll: Poll) -> None:
-        """Add a poll."""
+        """Add a poll.
+
+        Raises:
+            DeviceError: the position is no number.
+        """
+        if not math.isfinite(poll.position):
+            raise DeviceError(f"{AXES[poll.axis]} is reported to be at {poll.position}; correct the driver")
         if poll.t < self._valid or poll.moving:
             self._since = None
-        elif self._since is None or not self.facts.is_near(poll.position, self._rest):
+        elif self._since is None or not self._stays(poll.position):
             self._since, self._rest = poll.t, poll.position
         self.polls.append(poll)
+
+    def _stays(self, position: float) -> bool:
+        """Whether a position is within the slack to either side of a place that the last ones are in too."""
+        return abs(position - self._rest) <= 2 * self.facts.slack + self.facts.same
 
     def expect_motion(self, t: float) -> None:
         """Count the axis as moving, until polls after ``t`` [s] show that it stands."""

@@ -254,6 +254,7 @@ class PolledHeadSettings:
 
 TRIES = 3  # of a move, and of polls in a row, that end because the unit was silent
 PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
+UNHEARD_S = 5.0  # a unit that reports no position for this time is dead [s]
 LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: a unit may answer only when it stands [s]
 
 
@@ -316,6 +317,9 @@ class Loop:
         self.halted = 0  # number of the newest halt that was taken out of the queue
         self.rests = False  # whether the unit acknowledged the last halt, after which nothing more is sent
         self.errors: deque[DeviceError] = deque(maxlen=1)  # of a move without a waiting caller; the next call raises it
+        self.lens_errors: deque[DeviceError] = deque(maxlen=1)
+        self._zooming: tuple[float, float] | None = None  # the lens's goal, and when it should have arrived [s]
+        self._heard_t = clock.now()
         while not all(track.polls for track in self._tracks):
             self._poll_axes()
         self.snapshot, self.lens_snapshot = self._see(self._head), self._see(self._lens)
@@ -417,8 +421,14 @@ class Loop:
             self.requests.zooms.appendleft(position)  # a newer one replaces it
             raise
         except RefusedError as error:
-            self.errors.append(error)
+            self.lens_errors.append(error)
+            return
         self._expect_motion(self._lens)
+        (lens,) = self._lens
+        longest = abs(position - lens.newest.position) / lens.facts.fastest + 2 * lens.facts.braking_s(
+            lens.facts.fastest
+        )
+        self._zooming = position, self._clock.now() + longest + self._delay + PATIENCE_S
 
     def _expect_motion(self, tracks: Sequence[AxisTrack]) -> None:
         for track in tracks:
@@ -433,16 +443,33 @@ class Loop:
                 self._active = None
                 self.snapshot = self._see(self._head)
                 move.finish()
-            elif self._late(move, move.deadline):
+            elif min(track.newest.t for track in self._head) > move.deadline:  # a late thread alone does not count
                 self._refuse_stalled(move)
             else:
                 self._renew(move)
+        self._check_lens()
         self.snapshot, self.lens_snapshot = self._see(self._head), self._see(self._lens)
 
     def _poll_axes(self) -> None:
+        now = self._clock.now()
         for poll in self._link.poll(self.requests):
             self._tracks[poll.axis].add(poll)
+            self._heard_t = now
+        if now - self._heard_t > UNHEARD_S:
+            raise SilentError(f"the unit at {self._link.name} has reported no position for {UNHEARD_S:g} s")
         self._cuts = 0
+
+    def _check_lens(self) -> None:
+        """Keep an error for the lens's next caller if it does not arrive in time."""
+        if self._zooming is None:
+            return
+        (lens,), (goal, deadline) = self._lens, self._zooming
+        if lens.stands() and lens.facts.is_near(lens.newest.position, goal):
+            self._zooming = None
+        elif lens.newest.t > deadline:
+            self._zooming = None
+            at = f"{lens.newest.position:g} where {goal:g} was commanded"
+            self.lens_errors.append(DeviceError(f"the lens at {self._link.name} did not arrive in time: it is at {at}"))
 
     def _renew(self, move: Move) -> None:
         try:
@@ -479,22 +506,30 @@ class Loop:
         goals = zip(self._head, move.goals, strict=True)
         return [track for track, goal in goals if not track.facts.is_near(track.newest.position, goal)]
 
-    def _late(self, move: Move, deadline: float) -> bool:
-        """Return whether a poll after the deadline shows an axis off its goal; a late thread alone does not count."""
-        return min(track.newest.t for track in self._head) > deadline and bool(self._off_goal(move))
-
     def _refuse_stalled(self, move: Move) -> None:
         """End a move that did not arrive in time; raise where an axis may have lost its position."""
         pan, tilt = (f"{track.newest.position:g}" for track in self._head)
         wanted = ", ".join(f"{goal:g}" for goal in move.goals)
-        what = f"did not arrive in time: pan {pan}, tilt {tilt} steps, where {wanted} were commanded; it was halted"
+        what = f"did not arrive in time: pan {pan}, tilt {tilt}, where {wanted} were commanded; it was halted"
+        if not self._off_goal(move):
+            what = f"is where it was sent, pan {pan}, tilt {tilt}, but does not come to rest; it was halted"
         if any(track.facts.loses_steps for track in self._off_goal(move)):
             raise PositionLostError(
                 self._link.name,
                 f"{what}, and its position may be lost by something in its way or a weak motor supply",
             )
         why = "see that nothing is in its way; if it always ends as far off, give its axes more slack in the driver"
+        if not self._off_goal(move):
+            why = self.why_restless()
         self._give_up(move, DeviceError(f"the pan-tilt unit at {self._link.name} {what}; {why}"))
+
+    def why_restless(self) -> str:
+        """Explain why pan and tilt are not known to stand."""
+        if all(len({poll.t for poll in track.polls}) == 1 for track in self._head):
+            return "its positions have the same time over and over; correct the driver"
+        if any(track.newest.moving for track in self._head):
+            return "it says that it moves; if it stands all the same, let its driver give moving=None"
+        return "if it trembles there, give its axes more slack in the driver"
 
     @staticmethod
     def _stand(tracks: Sequence[AxisTrack]) -> bool:
@@ -723,8 +758,8 @@ class PolledHead:
         while self._loop.snapshot.moving:
             if clock.now() > deadline:
                 raise DeviceError(
-                    f"the pan-tilt unit at {self._link.name} goes on turning though it was halted; one that trembles "
-                    "there needs slack in its driver's AxisFacts"
+                    f"the pan-tilt unit at {self._link.name} does not come to rest though it was halted; "
+                    f"{self._loop.why_restless()}"
                 )
             self._loop.turn()
 
@@ -792,16 +827,24 @@ class PolledLens:
         """Start the lens moving and return at once the focal length that it will reach [px].
 
         Raises:
-            DeviceError: an error occurred since the last call of lens or head.
+            DeviceError: the focal length is not above zero, the lens did not arrive, or another error occurred since
+                the last call.
         """
-        self._raise_pending()
+        self._raise_errors()
+        if not 0 < focal_px < math.inf:
+            raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
         position = self._positions.position_for(focal_px)
         self._loop.requests.add(self._loop.requests.zooms, position)
         return self._positions.focal_at(position)
 
     def state(self) -> ZoomState:
         """Return the focal length of the last poll, at once. Raises as `zoom` does."""
-        self._raise_pending()
+        self._raise_errors()
         waiting = bool(self._loop.requests.zooms)  # in this order, as in `PolledHead.state`
         seen = self._loop.lens_snapshot
         return ZoomState(self._positions.focal_at(seen.positions[0]), seen.moving or waiting, seen.t)
+
+    def _raise_errors(self) -> None:
+        self._raise_pending()
+        with contextlib.suppress(IndexError):
+            raise self._loop.lens_errors.popleft()

@@ -357,7 +357,7 @@ def open_hardware(config: RigConfig, file: Path | None = None, partial: bool = F
         except ConfigError as error:
             missing |= dict.fromkeys(("zoom", "head") if device.role == "ptz" else (role,), error)
     if missing and (not partial or missing.keys() >= found.keys()):
-        raise next(iter(missing.values()))
+        raise min(missing.items(), key=lambda each: not getattr(config.hardware, each[0], None))[1]
     sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
     clock, spec = MonotonicClock(), _spec(found)
     with contextlib.ExitStack() as opened:

@@ -33,8 +33,9 @@ from cotarget.safety.watchdog import Watchdog, Watcher
 
 log = logging.getLogger(__name__)
 
-# From a command until it is known that the head has arrived, without its way: a few polls over a network at 10 Hz [s].
-ARRIVAL_S = 0.5
+# For a waited move, without its way and braking [s]: longer than a driver's own deadline, 2 s and the command's delay
+# after that, because the driver knows what a head that does not arrive means.
+ARRIVAL_S = 3.5
 SLOWNESS = 1.5  # factor by which a loaded unit may take longer than its speed and acceleration give
 ANGLE_ROUNDING = 1e-9  # [rad]
 
@@ -103,10 +104,10 @@ class SafeHead:
             return 0.0  # only a simulated head has infinite speed, and its wait is not watched
         state, longest = self._head.state(), 0.0
         ways = (goal[0] - state.pan, goal[1] - state.tilt)
-        for way, speed, axis in zip(ways, speeds, self._limits.axes, strict=True):
+        for way, speed, limits in zip(ways, speeds, self._limits.axes, strict=True):
+            axis = replace(limits, speed=speed)
             # A head that turns the other way must brake first, and then come back.
-            back_s = 2 * axis.braking_s if state.moving else 0.0
-            longest = max(longest, replace(axis, speed=speed).travel_s(way) + back_s)
+            longest = max(longest, axis.travel_s(way) + 2 * axis.braking_s)
         return ARRIVAL_S + SLOWNESS * longest
 
 

