@@ -208,7 +208,7 @@ def test_a_head_beyond_its_limits_is_not_moved():
     devices.head.move(np.radians(100), 0.0, wait=True)
     with guarded(devices, SafetyConfig(pan_deg=(-45.0, 45.0))) as rig:
         devices.head.log.clear()
-        with pytest.raises(DeviceError, match="cotarget point --pan-deg"):
+        with pytest.raises(DeviceError, match="cotarget point --rig RIG --pan-deg"):
             measure_head(rig)
         assert devices.head.log == []
         servo = with_axes(rig.head.limits, slack=math.radians(60.0))

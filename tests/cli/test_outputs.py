@@ -270,7 +270,7 @@ def test_point_moves_no_axis_that_is_not_asked_for(pointed, capsys, folder, want
     (folder / "rig.toml").write_text("[safety]\npan_deg = [-45, 45]\n")
     step = math.degrees(pointed.head.limits.pan.step)
     if wanted[:1] == ["--tilt-deg"]:
-        assert "cotarget point --pan-deg" in refused(capsys, "point", "--rig", "rig.toml", *wanted)
+        assert "cotarget point --rig RIG --pan-deg" in refused(capsys, "point", "--rig", "rig.toml", *wanted)
     else:
         said = json.loads(call(capsys, "point", "--rig", "rig.toml", *wanted)[1])
         assert [said["pan_deg"], said["tilt_deg"]] == pytest.approx(moved or [100, 0], abs=step)
