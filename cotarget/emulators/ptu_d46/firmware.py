@@ -1,9 +1,8 @@
 """Firmware of the emulated PTU-D46: a state machine from bytes to bytes, on a given clock.
 
-It implements the ASCII command language of the Command Reference Manual v3.00D and of the PTU-D46 manual v2.14.0, and
-the deviations of units in the field (`cotarget.emulators.ptu_d46.unit`), without the binary language and without what
-neither our driver nor a known program sends: scanning, presets, setting the step mode, expansion ports, endless pan.
-Choices where no source says what happens: docs/design-notes.md.
+It implements the ASCII commands of the Command Reference Manual v3.00D and of the PTU-D46 manual v2.14.0 that our
+driver, MRPT and flir-ptu send; every other one is refused. Choices where no source says what happens:
+docs/design-notes.md.
 """
 
 import random
@@ -14,21 +13,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from cotarget.emulators.plant import AxisPlant
-from cotarget.emulators.ptu_d46.unit import (
-    RefusalError,
-    Task,
-    Unit,
-    UnitAxis,
-    UnitAxisSettings,
-    UnitProfile,
-    refuse_beyond,
-)
+from cotarget.emulators.ptu_d46.unit import Task, UnitAxis, UnitProfile
 from cotarget.emulators.serve import Faults
 
 # Commands
 
 Answer = str | Task
-Version = tuple[int, int, int]
+ILLEGAL = "Illegal argument"
+
+
+class RefusalError(Exception):
+    """The unit refuses a command: it answers an exclamation mark and this message."""
 
 
 @dataclass(frozen=True)
@@ -36,238 +31,74 @@ class Command:
     """A command of the unit."""
 
     name: str  # its letters; a small x stands for P (pan) or T (tilt)
-    # `NUMBER`, other numbers as a regular expression, a choice of letters such as "[ED]", or empty for no argument.
-    argument: str = ""
-    # Answers the command without argument, which mostly is a query; None where the argument is needed.
-    alone: Callable[[Unit, UnitAxis], Answer] | None = None
-    # Answers the command with its argument, an int where all of it is a number.
-    given: Callable[[Unit, UnitAxis, Any], Answer] | None = None
-    since: Version = (0, 0, 0)  # first firmware version that has it
+    argument: str = ""  # `NUMBER`, or a choice of letters such as "[ED]"; empty for no argument
+    # Answers the command without argument, which mostly is a query.
+    alone: Callable[["D46", UnitAxis], Answer] | None = None
+    # Answers the command with its argument, an int where it is a number.
+    given: Callable[["D46", UnitAxis, Any], Answer] | None = None
 
 
 NUMBER = r"[+-]?\d{1,9}"
-# Baud rates of `@`; the E-series has more, and one D46 was seen at 38400.
-BAUDS, E_BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400), (57600, 115200)
-E_VERSION = (3, 0, 0)
-BYTE_DELAYS_MS = (0, *range(10, 1001))
-POWER = {"R": "REGULAR", "L": "LOW", "O": "OFF", "H": "HIGH"}
 
 
-def _bound(
-    letter: str, name: str, allowed: Callable[[Unit, UnitAxisSettings, int], bool], sentence: str | None = None
-) -> Command:
-    """Describe the command of an axis's bound, set once the axis stands; without a sentence, of its acceleration."""
-
-    def given(unit: Unit, axis: UnitAxis, n: int) -> Answer:
-        if not allowed(unit, axis.settings, n):
-            raise RefusalError(unit.wording.out_of_range)
-        return unit.change(axis, name, n)
-
-    return Command(
-        f"x{letter}",
-        NUMBER,
-        lambda u, a: u.say(sentence or u.wording.acceleration, a, getattr(a.settings, name)),
-        given,
-    )
+def _query(name: str, sentence: str, value: Callable[["D46", UnitAxis], object]) -> Command:
+    """Describe a query, answered by a sentence or by the value alone."""
+    return Command(name, alone=lambda u, a: u.say(sentence, a, value(u, a)))
 
 
-def _limit(letter: str, side: int, word: str) -> tuple[Command, Command]:
-    """Describe the commands of the limit that the reset found, and of the user's, in force after LU."""
-    name = ("user_lowest", "user_highest")[side]
-
-    def given(unit: Unit, axis: UnitAxis, n: int) -> str:
-        refuse_beyond(axis, n, axis.limits)
-        return _set(axis.settings, name, n)
-
-    sentence = f"{word} user defined {{axis}} Position is {{n}}"
-    return (
-        Command(f"x{letter}", alone=lambda u, a: u.say(f"{word} {{axis}} position is {{n}}", a, a.limits[side])),
-        Command(f"x{letter}U", NUMBER, lambda u, a: u.say(sentence, a, getattr(a.settings, name)), given, (2, 13, 1)),
-    )
-
-
-def _power(letter: str, name: str, choices: str) -> Command:
-    """Describe the command of the motor's power at rest or in motion."""
-
-    def alone(unit: Unit, axis: UnitAxis) -> str:
-        word = POWER[getattr(axis.settings, name)]
-        terse = unit.wording.regular if word == "REGULAR" else word
-        return unit.say(f"{{axis}} in {word} {name} power mode", axis, terse)
-
-    return Command(f"x{letter}", choices, alone, lambda u, a, choice: _set(a.settings, name, choice))
-
-
-def _switch(letter: str, name: str, answers: dict[str, str]) -> Command:
-    """Describe the command of a setting with a few choices, each with its answer to the query."""
-    return Command(
-        letter,
-        f"[{''.join(answers)}]",
-        lambda u, a: answers[getattr(u.settings, name)],
-        lambda u, a, choice: _set(u.settings, name, choice),
-    )
-
-
-def _set(settings: object, name: str, value: int | str) -> str:
-    setattr(settings, name, value)
+def _set_echo(unit: "D46", _: UnitAxis, choice: str) -> str:
+    unit.echo = choice == "E"
     return ""
 
 
-def _present_speed(unit: Unit, axis: UnitAxis) -> int:
-    speed = axis.plant.speed()
-    return round(speed if unit.velocity_mode else abs(speed))
-
-
-def _limits(unit: Unit, _: UnitAxis, choice: str) -> str:
-    if choice == "U" and unit.profile.version < (2, 13, 1):
-        raise RefusalError(unit.wording.illegal)
-    return _set(unit.settings, "limits", choice)
-
-
-def _execution(immediate: bool) -> Callable[[Unit, UnitAxis], str]:
-    def alone(unit: Unit, _: UnitAxis) -> str:
-        unit.settings.immediate = immediate
-        if immediate:
-            unit.release_pending()
-        return ""
-
-    return alone
-
-
-def _await_arrival(unit: Unit, _: UnitAxis) -> Answer:
-    unit.release_pending()
-    return unit.wait_until_still(*unit.axes)
-
-
-def _halt(unit: Unit, *axes: UnitAxis) -> Answer:
-    for axis in axes:
-        axis.velocity = 0
-        axis.halt()
-    return unit.wait_until_still(*axes) if unit.profile.halt_waits else ""
-
-
-def _mode(unit: Unit, _: UnitAxis) -> str:
-    words = unit.wording.velocity if unit.velocity_mode else unit.wording.independent
-    return words[0 if unit.settings.feedback == "V" else 1]
-
-
-def _set_mode(unit: Unit, _: UnitAxis, choice: str) -> str:
-    unit.set_velocity_mode(choice == "V")
-    return ""
-
-
-def _reset(unit: Unit, _: UnitAxis, which: str) -> Answer:
-    if unit.profile.reset_at_once and which != "D":
-        return unit.reset(which)
-    return _set(unit.settings, "reset", which)
-
-
-def _defaults(unit: Unit, _: UnitAxis, choice: str) -> str:
-    if choice == "S":
-        unit.save()
-    else:
-        unit.restore(factory=choice == "F")
-    return ""
-
-
-def _select(unit: Unit, _: UnitAxis, n: int) -> str:
-    unit.selected = n in (0, unit.settings.network_id) or unit.settings.network_id == 0
-    return ""
-
-
-def _serial_line(unit: Unit, _: UnitAxis, argument: str) -> str:
-    baud, delay_ms, kept = argument.strip("()").split(",")
-    known = BAUDS + (E_BAUDS if unit.profile.version >= E_VERSION else ())
-    if unit.settings.network_id != 0 or int(baud) not in known or int(delay_ms) not in BYTE_DELAYS_MS:
-        raise RefusalError(unit.wording.illegal)
-    unit.baud, unit.byte_delay_s = int(baud), int(delay_ms) / 1000
-    if kept == "T":
-        unit.baud_at_power_up = unit.baud
+def _set_verbose(unit: "D46", _: UnitAxis, choice: str) -> str:
+    unit.verbose = choice == "V"
     return ""
 
 
 COMMANDS = (
     # Motion, set even during a move
     Command(
-        "xP",
-        NUMBER,
-        lambda u, a: u.say("Current {axis} position is {n}", a, a.position),
-        Unit.move,
+        "xP", NUMBER, lambda u, a: u.say("Current {axis} position is {n}", a, a.position), lambda u, a, n: u.move(a, n)
     ),
     Command(  # offset from the present position; query of the desired one
         "xO",
         NUMBER,
-        lambda u, a: u.say(u.wording.offset, a, a.desired),
+        lambda u, a: u.say("Target {axis} position is {n}", a, a.desired),
         lambda u, a, n: u.move(a, a.position + n),
     ),
     Command(
         "xS",
         NUMBER,
-        lambda u, a: u.say(u.wording.speed, a, a.velocity if u.velocity_mode else a.settings.speed),
-        Unit.set_speed,
+        lambda u, a: u.say("Target {axis} speed is {n} positions/sec", a, a.speed),
+        lambda u, a, n: u.set_speed(a, n),
     ),
-    Command(  # offset from the present speed, also of the query
-        "xD",
-        NUMBER,
-        lambda u, a: u.say("Current {axis} speed is {n} positions/sec", a, _present_speed(u, a)),
-        lambda u, a, n: u.set_speed(a, _present_speed(u, a) + n),
-    ),
-    # Bounds and acceleration, set once the axis stands
-    _bound("A", "acceleration", lambda u, s, n: n > 0),
-    _bound("B", "base", lambda u, s, n: 0 <= n <= s.upper, "Current {axis} base speed is {n} positions/sec"),
-    _bound(
-        "U",
-        "upper",
-        lambda u, s, n: max(s.lower, 1) <= n <= u.profile.ceiling,
-        "Maximum {axis} speed is {n} positions/sec",
-    ),
-    _bound("L", "lower", lambda u, s, n: 0 <= n <= s.upper, "Minimum {axis} speed is {n} positions/sec"),
-    # Limits and resolution
-    *_limit("N", 0, "Minimum"),
-    *_limit("X", 1, "Maximum"),
-    Command("xR", alone=lambda u, a: u.say(u.wording.resolution, a, u.profile.resolution)),
-    Command(
-        "L",
-        "[EDU]",
-        lambda u, a: {
-            "E": "Limit bounds are ENABLED (soft limits enabled)",
-            "D": "Limit bounds are DISABLED (hard limits only: use care)",
-            "U": "Limit user defined bounds are enabled",
-        }[u.settings.limits],
-        _limits,
-    ),
+    # Bounds, limits and resolution
+    _query("xA", "{axis} acceleration is {n} positions/sec^2", lambda u, a: u.profile.acceleration),
+    _query("xU", "Maximum {axis} speed is {n} positions/sec", lambda u, a: u.profile.highest_speed),
+    _query("xL", "Minimum {axis} speed is {n} positions/sec", lambda u, a: u.profile.lowest_speed),
+    _query("xN", "Minimum {axis} position is {n}", lambda u, a: a.limits[0]),
+    _query("xX", "Maximum {axis} position is {n}", lambda u, a: a.limits[1]),
+    _query("xR", "{n} seconds arc per position", lambda u, a: u.profile.resolution),
     # Execution
-    Command("I", alone=_execution(immediate=True)),
-    Command("S", alone=_execution(immediate=False)),
-    Command("A", alone=_await_arrival),
-    Command("H", alone=lambda u, a: _halt(u, *u.axes)),
-    Command("Hx", alone=_halt),
-    Command("C", "[IV]", _mode, _set_mode, (1, 9, 7)),
-    Command("R", "[EPTD]", lambda u, a: u.reset(u.settings.reset), _reset),
+    Command("I", alone=lambda u, a: ""),  # positions are executed at once, as they are here anyhow
+    Command("A", alone=lambda u, a: u.wait_until_still()),
+    Command("H", alone=lambda u, a: u.halt()),
+    Command("C", "I", lambda u, a: "independent control mode", lambda u, a, choice: ""),
+    Command("R", alone=lambda u, a: u.reset()),
     # The unit
-    _power("H", "hold", "[RLO]"),
-    _power("M", "move", "[RLH]"),
-    Command("Wx", alone=lambda u, a: u.say("{axis} axis is in HALF step mode", a, "H"), since=(2, 12, 8)),
-    _switch("E", "echo", {"E": "Echoing ON", "D": "Echoing OFF"}),
-    _switch("F", "feedback", {"V": "ASCII verbose mode", "T": "ASCII terse mode"}),
-    Command("D", "[SRF]", given=_defaults),
+    Command("E", "[ED]", lambda u, a: f"Echoing {'ON' if u.echo else 'OFF'}", _set_echo),
+    Command("F", "[VT]", lambda u, a: f"ASCII {'verbose' if u.verbose else 'terse'} mode", _set_verbose),
     Command("V", alone=lambda u, a: u.profile.title),
-    Command("O", alone=lambda u, a: "Input 30 VDC @ 86 degF"),
-    Command(  # number on a shared line, and selection by it
-        "U",
-        r"\d{1,3}",
-        lambda u, a: u.say("Unit ID is {n}", a, u.settings.network_id),
-        lambda u, a, n: _set(u.settings, "network_id", n),
-    ),
-    Command("_", r"\d{1,3}", given=_select),
-    Command("@", r"\(\d{1,7},\d{1,5},[TF]\)", lambda u, a: "", _serial_line),  # alone: back from an expansion port
+    _query("U", "Unit ID is {n}", lambda u, a: 0),
+    _query("Wx", "{axis} axis is in HALF step mode", lambda u, a: "H"),
 )
 FORMS = [
-    (re.compile(f"{re.escape(c.name).replace('x', '(?P<axis>[PT])')}(?P<argument>{c.argument})?", re.ASCII), c)
-    for c in COMMANDS
+    (re.compile(f"{c.name.replace('x', '(?P<axis>[PT])')}(?P<argument>{c.argument})?", re.ASCII), c) for c in COMMANDS
 ]
 
 
-def execute(unit: Unit, text: str) -> Answer:
+def execute(unit: "D46", text: str) -> Answer:
     """Carry out one command, in capital letters.
 
     Returns:
@@ -277,24 +108,22 @@ def execute(unit: Unit, text: str) -> Answer:
         RefusalError: the command is refused; its message is the text after the exclamation mark.
     """
     for form, command in FORMS:
-        match = form.fullmatch(text)
-        if match is None or command.since > unit.profile.version:
+        if (match := form.fullmatch(text)) is None:
             continue
-        axis = unit.tilt if match.groupdict().get("axis") == "T" else unit.pan
+        axis = unit.axes[match.groupdict().get("axis") == "T"]
         argument = match["argument"]
         if argument and command.given:
-            return command.given(unit, axis, int(argument) if re.fullmatch(NUMBER, argument) else argument)
+            return command.given(unit, axis, int(argument) if command.argument == NUMBER else argument)
         if not argument and command.alone:
             return command.alone(unit, axis)
-    raise RefusalError(unit.wording.illegal)
+    raise RefusalError(ILLEGAL)
 
 
 # Bytes
 
 SPACE, CR, LF = 0x20, 0x0D, 0x0A
 NEWLINE = "\r\n"
-# Longest command, and size of the input buffer while the unit is busy [bytes]. Unselected units were seen to keep
-# about 100 bytes.
+# Longest command, and size of the input buffer while the unit is busy [bytes].
 LONGEST_COMMAND = 100
 INPUT_BUFFER = 256
 # Delay of replies with the fault late-replies [s]: longer than drivers wait for ordinary commands.
@@ -328,7 +157,10 @@ class D46:
         self, pan: AxisPlant, tilt: AxisPlant, unit: UnitProfile, faults: Faults, now: Callable[[], float]
     ) -> None:
         self.faults = faults
-        self._unit = Unit(pan, tilt, unit, now)
+        self.profile: UnitProfile = unit
+        self.echo: bool = True
+        self.verbose: bool = True
+        self.axes = UnitAxis("Pan", pan, unit, unit.pan), UnitAxis("Tilt", tilt, unit, unit.tilt)
         self._now = now
         self._input: deque[int] = deque()
         self._command = bytearray()
@@ -336,15 +168,58 @@ class D46:
         self._output: deque[tuple[float, bytes]] = deque()  # (time to send [s], bytes)
         self._noise = random.Random(0)
 
-    @property
-    def baud(self) -> int:
-        """Baud rate of the serial line, from the byte after the last output on."""
-        return self._unit.baud
+    # What commands do
 
-    @property
-    def byte_delay_s(self) -> float:
-        """Pause after each byte sent [s]."""
-        return self._unit.byte_delay_s
+    def say(self, sentence: str, axis: UnitAxis, value: object) -> str:
+        """Make the answer to a query, a sentence or the value alone."""
+        return sentence.format(axis=axis.name, n=value) if self.verbose else str(value)
+
+    def move(self, axis: UnitAxis, goal: int) -> str:
+        """Go to a position.
+
+        Raises:
+            RefusalError: the position is beyond a limit.
+        """
+        lowest, highest = axis.limits
+        if goal > highest:
+            raise RefusalError(f"Maximum allowable {axis.name} position is {highest}")
+        if goal < lowest:
+            raise RefusalError(f"Minimum allowable {axis.name} position is {lowest}")
+        axis.go(goal)
+        return ""
+
+    def set_speed(self, axis: UnitAxis, speed: int) -> str:
+        """Set a speed, even during a move.
+
+        Raises:
+            RefusalError: the speed is out of bounds.
+        """
+        if speed > self.profile.highest_speed:
+            raise RefusalError(f"{axis.name} speed cannot exceed {self.profile.highest_speed} positions/sec")
+        if speed < self.profile.lowest_speed:
+            raise RefusalError(f"Motor speed cannot be less than {self.profile.lowest_speed} pos/sec")
+        axis.set_speed(speed)
+        return ""
+
+    def halt(self) -> str:
+        """Brake both axes; the sources do not say whether the answer waits until they stand, and here it does not."""
+        for axis in self.axes:
+            axis.halt()
+        return ""
+
+    def wait_until_still(self) -> Task:
+        """Wait until the axes stand."""
+        while any(axis.plant.moving() for axis in self.axes):
+            yield ""
+        return ""
+
+    def reset(self) -> Task:
+        """Find the limits of both axes, tilt first, as real units' replies show."""
+        for axis in reversed(self.axes):
+            yield from axis.reset()
+        return ""
+
+    # Bytes
 
     def receive(self, data: bytes) -> None:
         """Process bytes that arrive on the line now."""
@@ -364,43 +239,32 @@ class D46:
             due += self._output.popleft()[1]
         return bytes(due)
 
-    def connected(self) -> None:
-        """Handle a new TCP client; E-series units greet it."""
-        self._send(self._unit.profile.greeting)
-
-    def power_on(self, calibrate: bool = True) -> None:
-        """Interrupt the power: banner, then with ``calibrate`` the power-up reset, then a star."""
+    def _restart(self) -> Task:
+        """Interrupt the power: settings and position are lost; a banner comes, and then a star."""
         self._input.clear()
         self._command.clear()
         self._output.clear()
-        self._unit.lose_power()
-        self._send(self._unit.profile.banner)
-        self._task = self._boot(calibrate)
-
-    def _boot(self, calibrate: bool) -> Task:
-        ready = self._now() + self._unit.profile.boot_s
+        self.echo = self.verbose = True
+        for axis in self.axes:
+            axis.lose_power()
+        ready = self._now() + self.profile.boot_s
+        yield f"{NEWLINE}{self.profile.title}{NEWLINE}"
         while self._now() < ready:
             yield ""
-        if calibrate:
-            yield from self._unit.reset(self._unit.settings.reset)
         return ""
 
     def _advance(self) -> None:
-        """Do what is due by now: faults, stops hit, the task, and characters that waited for it."""
+        """Do what is due by now: faults, the task, and characters that waited for it."""
         if self.faults.take("power-cycle"):
-            self.power_on(calibrate=False)
-        for axis in self._unit.axes:
-            if axis.stopped_at_stop() or self._hits_obstacle(axis):
+            self._task = self._restart()
+            self._run_task()
+        for axis in self.axes:
+            if "limit-hit" in self.faults and (speed := axis.plant.speed()):
+                self.faults.set("limit-hit", False)
+                axis.lose_steps(1 if speed > 0 else -1)
                 self._send(f"!{axis.letter}")
         self._run_task()
         self._process_input()
-
-    def _hits_obstacle(self, axis: UnitAxis) -> bool:
-        if "limit-hit" not in self.faults or not (speed := axis.plant.speed()):
-            return False
-        self.faults.set("limit-hit", False)
-        axis.lose_steps(1 if speed > 0 else -1)
-        return True
 
     def _run_task(self) -> None:
         """Continue the command that takes time; its end is the reply."""
@@ -422,8 +286,7 @@ class D46:
 
     def _character(self, character: int) -> None:
         """Process one character: echo it, and at a delimiter carry out the command before it."""
-        unit = self._unit
-        if unit.settings.echo == "E" and unit.selected:
+        if self.echo:
             self._send(chr(character))
         if character not in (SPACE, CR, LF):
             if len(self._command) < LONGEST_COMMAND:
@@ -431,24 +294,22 @@ class D46:
             return
         text = self._command.decode("latin-1").upper()
         self._command.clear()
-        if text and (unit.selected or text.startswith("_")):
-            self._carry_out(text, character)
+        if text:
+            self._carry_out(text)
 
-    def _carry_out(self, text: str, delimiter: int) -> None:
+    def _carry_out(self, text: str) -> None:
         """Carry out one command; reply now or by a task."""
-        if delimiter == CR and self._unit.profile.leading_lf:
-            self._send("\n")
         try:
             if "error-replies" in self.faults and not text.startswith("H"):
-                raise RefusalError(self._unit.wording.illegal)
-            answer = execute(self._unit, text)
+                raise RefusalError(ILLEGAL)
+            answer = execute(self, text)
         except RefusalError as refusal:
             self._reply("!", str(refusal))
             return
         if not isinstance(answer, str):
             self._task = answer
             self._run_task()
-        elif self._unit.selected:
+        else:
             self._reply("*", answer)
 
     def _reply(self, mark: str, text: str) -> None:

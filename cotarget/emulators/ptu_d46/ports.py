@@ -19,12 +19,11 @@ from cotarget.emulators.ptu_d46.firmware import D46
 from cotarget.emulators.serve import LOCAL, Closes, open_listener
 from cotarget.errors import DeviceError
 
-BITS = 10  # of a byte: start, eight, stop
+BAUD, BITS = 9600, 10  # factory setting of the line; bits of a byte: start, eight, stop
 TICK_S = 0.005  # period of asking an idle firmware for output, and of checking whether the ports close [s]
 RECEIVE = 4096  # bytes
 SEND_TIMEOUT_S = 1.0  # a TCP client that reads nothing for this time is dropped [s]
 SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
-CODES = {baud: code for code, baud in SPEEDS.items()}
 
 
 class Wire:
@@ -33,32 +32,30 @@ class Wire:
     def __init__(self, firmware: D46) -> None:
         self._firmware = firmware
         self._noise = random.Random(0)
-        self._baud = firmware.baud  # of the firmware's next output
         self._in: deque[tuple[float, int, int | None]] = deque()
-        self._out: deque[tuple[float, int, int]] = deque()
+        self._out: deque[tuple[float, int]] = deque()
         self._in_free = self._out_free = 0.0
 
     def feed(self, data: bytes, now: float, baud: int | None = None) -> None:
         """Put bytes from the client on the wire now [s].
 
-        If the client's baud rate differs from the firmware's, noise arrives; None is the firmware's own.
+        If the client's baud rate differs from the unit's, noise arrives; None is the unit's own.
         """
         for byte in data:
-            self._in_free = max(self._in_free, now) + BITS / (baud or self._firmware.baud)
+            self._in_free = max(self._in_free, now) + BITS / (baud or BAUD)
             self._in.append((self._in_free, byte, baud))
 
     def step(self, now: float, baud: int | None = None) -> bytes:
         """Pass to the firmware the bytes that have arrived; return those at a client with this baud rate."""
         while self._in and self._in[0][0] <= now:
             arrived, byte, sent_at = self._in.popleft()
-            agreed = sent_at is None or sent_at == self._firmware.baud
-            self._firmware.receive(bytes([byte]) if agreed else self._noise.randbytes(1))
+            self._firmware.receive(bytes([byte]) if sent_at in (None, BAUD) else self._noise.randbytes(1))
             self._collect(arrived)
         self._collect(now)
         due = bytearray()
         while self._out and self._out[0][0] <= now:
-            _, byte, sent_at = self._out.popleft()
-            due += bytes([byte]) if baud in (None, sent_at) else self._noise.randbytes(1)
+            _, byte = self._out.popleft()
+            due += bytes([byte]) if baud in (None, BAUD) else self._noise.randbytes(1)
         return bytes(due)
 
     def due(self) -> float | None:
@@ -72,11 +69,10 @@ class Wire:
         self._firmware.output()
 
     def _collect(self, ready: float) -> None:
-        """Put the firmware's output on the wire; a change of its baud rate applies from the next output on."""
+        """Put the firmware's output on the wire."""
         for byte in self._firmware.output():
-            self._out_free = max(self._out_free, ready) + BITS / self._baud + self._firmware.byte_delay_s
-            self._out.append((self._out_free, byte, self._baud))
-        self._baud = self._firmware.baud
+            self._out_free = max(self._out_free, ready) + BITS / BAUD
+            self._out.append((self._out_free, byte))
 
 
 class UnitPorts(Closes):
@@ -148,7 +144,7 @@ class UnitPorts(Closes):
         tty.setraw(master)
         tty.setraw(slave)
         attributes = termios.tcgetattr(slave)
-        attributes[4] = attributes[5] = CODES[self._firmware.baud]
+        attributes[4] = attributes[5] = termios.B9600
         termios.tcsetattr(slave, termios.TCSANOW, attributes)
         os.set_blocking(master, False)
         self._ends, self.port = (master, slave), os.ttyname(slave)
@@ -218,7 +214,6 @@ class UnitPorts(Closes):
             self._client = self._listener.accept()[0]
             self._client.settimeout(SEND_TIMEOUT_S)
             self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._firmware.connected()
 
     def _drop_client(self) -> None:
         if self._client is not None:
