@@ -1,6 +1,6 @@
 """Read and decode JPEG images from a multipart/x-mixed-replace stream.
 
-`Walk` finds a JPEG's end and size by its markers (ITU-T T.81, annex B). `decode_jpeg` decodes whole images and refuses
+`Walk` finds a JPEG's end by its markers (ITU-T T.81, annex B). `decode_jpeg` decodes whole images and refuses
 damaged ones. `MultipartReader` takes the stream's bytes and returns whole images. Nothing here does I/O.
 
 Servers differ in how they write the boundary, Content-Length may be missing or wrong, bytes may follow an image, and
@@ -20,12 +20,8 @@ from cotarget.rig import Image
 # Within compressed data 0xff is followed by a zero, a restart marker or another 0xff; any other byte makes a marker.
 MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 EOI, SOS = 0xD9, 0xDA
-# Frame headers, which hold the size: C0 to CF except tables (C4, CC) and a reserved marker (C8).
-SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # Markers that are followed by a length: frame headers, tables, scans, application data and comments.
-SEGMENTS = SIZED | {0xC4, 0xCC} | frozenset(range(SOS, 0xF0)) | {0xFE}
-# The shortest frame header, without its length: precision, height, width.
-SIZED_LENGTH = 5
+SEGMENTS = frozenset(range(0xC0, 0xD0)) - {0xC8} | frozenset(range(SOS, 0xF0)) | {0xFE}
 
 
 class Walk:
@@ -35,7 +31,6 @@ class Walk:
         self.position = 2  # index of the next byte to parse: behind the first marker
         self.end: int | None = None  # index after the last byte, once that has arrived
         self.broken = False  # whether the data are no JPEG
-        self.size = (0, 0)  # (width, height) [px]
         self._in_scan = False
 
     def advance(self, data: bytes | bytearray) -> None:
@@ -73,22 +68,9 @@ class Walk:
             return False
         if len(data) < start + 2 + length:
             return False
-        if marker in SIZED:
-            # A sequential or progressive JPEG has one frame header, with a height.
-            again, self.size = self.size != (0, 0), _size(data[start + 4 : start + 2 + length])
-            self.broken = again or 0 in self.size
         self.position = start + 2 + length
-        if marker == SOS:
-            self.broken = 0 in self.size
-            self._in_scan = True
+        self._in_scan = marker == SOS
         return True
-
-
-def _size(header: bytes | bytearray) -> tuple[int, int]:
-    """Read (width, height) from a frame header of precision, height and width; zeros if it is too short."""
-    if len(header) < SIZED_LENGTH:
-        return 0, 0
-    return int.from_bytes(header[3:5]), int.from_bytes(header[1:3])
 
 
 # Decoding
@@ -205,7 +187,6 @@ class JpegPicture:
     """A whole JPEG image."""
 
     jpeg: bytes
-    size: tuple[int, int]  # (width, height) in its header [px]
     t: float  # arrival of its first byte [s]
 
 
@@ -288,7 +269,7 @@ class MultipartReader:
             self.broken += 1
             self._skipped = 0
         else:
-            pictures.append(JpegPicture(bytes(self._data[:end]), walk.size, self._arrivals[0][1]))
+            pictures.append(JpegPicture(bytes(self._data[:end]), self._arrivals[0][1]))
             self._drop(end)
         return True
 

@@ -28,7 +28,6 @@ from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.geometry import Array
 from cotarget.rig import READ_TIMEOUT_S, PanTiltState, ZoomState
 from cotarget.schema import Size
-from cotarget.sim.model import has_clutter
 from cotarget.sim.render.pictures import SizedPictures
 from cotarget.sim.targets.random_paths import SECONDS, in_view
 from cotarget.sim.truth import CameraName, Outlines, part_seen
@@ -269,7 +268,7 @@ class Episode:
         self.config = config
         self.world = SimWorld(config, rendered=())
         self.rig, self.truth = self.world.rig, self.world.truth()
-        self.outlines = Outlines(self.truth, still=not has_clutter(config.sim))
+        self.outlines = Outlines(self.truth)
         self.detector = TruthDetector(self.outlines, config.sim.seed, noise)
         fixed = self.truth.T_world_fixed
         self._eye, self._to_fixed = fixed.translation, fixed.rotation.as_matrix().T

@@ -347,7 +347,6 @@ def sphere_points(count: int) -> Array:
 
 PHASES = 48  # of a limb cycle; from one to the next the tip of a wing moves by at most 2 % of the span
 EVERY = 6  # every sixth phase is used for the larger side over a cycle
-ROOM = 0.5  # largest distance of a target from the knots of its path, and of a pupil from its camera [m]
 DIRECTIONS = 160  # in which outermost points are searched, about 16 degrees apart
 Outline = tuple[Array, Array, Array]  # pixels of the centre, the top-left and the bottom-right corner, (2,) each
 
@@ -377,14 +376,8 @@ class Outlines:
         longest_px: true longest focal length of the zoom camera, along the rows [px].
     """
 
-    def __init__(self, truth: Truth, still: bool) -> None:
-        """Prepare each target's outermost points.
-
-        Args:
-            truth: ground truth of the world.
-            still: whether only targets and rig move. A single target that no static geom can occlude then counts as
-                visible without a test by rays.
-        """
+    def __init__(self, truth: Truth) -> None:
+        """Prepare each target's outermost points."""
         self.targets, self.fixed_lens, self.longest_px = truth.targets, truth.fixed_lens, truth.longest_px
         self._truth, self._model, self._data = truth, truth.model, mujoco.MjData(truth.model)
         mujoco.mj_kinematics(self._model, self._data)
@@ -395,7 +388,6 @@ class Outlines:
         self._reach = {name: float(np.linalg.norm(points, axis=1).max()) for name, points in self._points.items()}
         self._axes = [int(self._model.joint(RIG + axis).qposadr[0]) for axis in ("pan", "tilt")]
         self._bodies = {camera: self._model.body(RIG + camera).id for camera in get_args(CameraName)}
-        self._exposed = still and len(self.targets) == 1 and self._stands_free(*self.targets)
         self._fixed = self._placed("fixed", self.fixed_lens)
         # Cached results for the latest time, and for the zoom camera's latest pan, tilt and focal length.
         self._t = self._zoom_t = math.nan
@@ -437,7 +429,7 @@ class Outlines:
         if across <= 0 or down <= 0:
             return Silhouette(low, high, 0.0)
         inside = across * down / ((right - left) * (bottom - top))
-        return Silhouette(low, high, inside if self._exposed else inside * self._truth.unhidden(name, camera, t))
+        return Silhouette(low, high, inside * self._truth.unhidden(name, camera, t))
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
         """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind."""
@@ -503,34 +495,6 @@ class Outlines:
         x_image = (view.to_image @ turn) @ points + center[:, None]
         xy = x_image[:2] / x_image[2]
         return (view.lens.bend(xy.T) * view.lens.focal_px + view.lens.center_px).T if view.bent else xy
-
-    def _stands_free(self, name: str) -> bool:
-        """Check that no static geom can come between the cameras and a target, anywhere on its path.
-
-        A geom outside the box around the cameras and the whole path cannot. A plane cannot either if the cameras and
-        the target's centres are all in front of it; the feet of a person on the ground may touch it.
-        """
-        model, data, path = self._model, self._data, self.targets[name].path
-        way = np.array([path.position(t) for t in path.spline.x])
-        eyes = data.xpos[list(self._bodies.values())]
-        reach = self._reach[name] + ROOM
-        lever = float(np.linalg.norm(data.xpos[self._bodies["zoom"]] - data.xpos[model.body(RIG + "base").id]))
-        room = ROOM + 2 * lever  # the head carries the zoom camera round
-        low = np.minimum(way.min(axis=0) - reach, eyes.min(axis=0) - room)
-        high = np.maximum(way.max(axis=0) + reach, eyes.max(axis=0) + room)
-        root = model.body_rootid[model.geom_bodyid]
-        standing = (model.body_mocapid[root] < 0) & (model.geom_group < BOARD_GROUP)
-        for geom in np.flatnonzero(standing):
-            turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
-            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
-                if ((np.concatenate([way, eyes]) - place) @ turn[:, 2]).min() <= 0:
-                    return False
-                continue
-            middle = place + turn @ model.geom_aabb[geom, :3]
-            half = np.abs(turn) @ model.geom_aabb[geom, 3:]
-            if (middle - half <= high).all() and (middle + half >= low).all():
-                return False
-        return True
 
 
 Appearances = Truth | Outlines  # what tells where the targets are in both images

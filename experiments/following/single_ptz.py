@@ -195,7 +195,7 @@ def held(way: str, name: str, seed: int, seconds: float, miss: float) -> list[Ju
     """
     world = SimWorld(config_of(name, seed), rendered=())
     target, calibration = world.config.target(name), true_calibration(world)
-    outlines = Outlines(world.truth(), still=True)
+    outlines = Outlines(world.truth())
     shaken = Shaken(outlines, world.truth(), seed, miss)
     rows: list[Judged] = []
     with guard(world.rig, world.config.safety) as rig:

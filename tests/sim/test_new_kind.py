@@ -64,7 +64,7 @@ from cotarget.sim.world import SimWorld
 world = SimWorld(load_config("rig.toml"), rendered=())
 truth = world.truth()
 for name in ("kite", "kite2"):
-    for each in (truth, Outlines(truth, still=False)):
+    for each in (truth, Outlines(truth)):
         silhouette = each.silhouette(name, "fixed", 5.0)
         assert silhouette.visible == 1.0, silhouette
         print(name, *(f"{side:.1f}" for side in silhouette.size_px))

@@ -36,7 +36,7 @@ def world(name, seed, **effects):
 @pytest.mark.parametrize("name", ["book", "person", "bird"])
 def test_boxes_agree_with_the_truth_within_tolerance(name, effects):
     w = world(name, 3, **effects)
-    truth, outlines = w.truth(), Outlines(w.truth(), still=True)
+    truth, outlines = w.truth(), Outlines(w.truth())
     compared = 0
     with w.rig as rig:
         for k in range(20):
@@ -63,7 +63,7 @@ def test_boxes_agree_with_the_truth_within_tolerance(name, effects):
 
 def test_behind_a_camera_there_is_no_outline():
     w = world("book", 0)
-    outlines = Outlines(w.truth(), still=True)
+    outlines = Outlines(w.truth())
     with w.rig as rig:
         rig.head.move(2.7, 0.0, wait=True)
         t = rig.clock.now()
@@ -79,7 +79,7 @@ def test_a_box_that_is_cut_shows_in_part():
     paths = {"book": [[0, 4.66, 10, 1.6], [9, 4.66, 10, 1.6]]}
     sim = {"scene": "indoor", "targets": ["book"], "effects": {"all": False}, "paths": paths}
     w = SimWorld(parse_config({"sim": sim}), rendered=())
-    truth, outlines = w.truth(), Outlines(w.truth(), still=True)
+    truth, outlines = w.truth(), Outlines(w.truth())
     true, found = truth.silhouette("book", "fixed", 0.0), outlines.silhouette("book", "fixed", 0.0)
     assert found.low_px[0] < 639.5 < found.high_px[0]
     inside = (639.5 - found.low_px[0]) / (found.high_px[0] - found.low_px[0])
@@ -95,10 +95,9 @@ def test_an_occluder_lowers_visibility(tmp_path, x, ground, hidden):
     paths = {"book": [[0, 0, 10, 1.3], [9, 0, 10, 1.3]]}
     sim = {"scene": str(scene), "targets": ["book"], "effects": {"all": False}, "paths": paths}
     truth = SimWorld(parse_config({"sim": sim}), rendered=()).truth()
-    for still in (True, False):
-        visible = Outlines(truth, still).silhouette("book", "fixed", 0.0).visible
-        assert visible == truth.silhouette("book", "fixed", 0.0).visible
-        assert (visible < 1.0) == hidden
+    visible = Outlines(truth).silhouette("book", "fixed", 0.0).visible
+    assert visible == truth.silhouette("book", "fixed", 0.0).visible
+    assert (visible < 1.0) == hidden
 
 
 def test_a_table_has_a_phase_in_each_row():
