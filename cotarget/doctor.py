@@ -24,7 +24,6 @@ from cotarget.files import assets_dir
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
 
-OLDEST_PYTHON = (3, 11)
 # Rendering is tried in its own process, because a broken OpenGL may crash it.
 RENDER = (
     "from cotarget.sim.render.opengl import BACKEND, make_renderer, mujoco;"
@@ -47,7 +46,7 @@ class Finding:
 def examine(config: "RigConfig | None" = None, rig: Path = Path("rig.toml")) -> list[Finding]:
     """Examine everything that cotarget needs; with a rig's configuration and file also its devices."""
     found = [
-        _python(),
+        Finding("python", True, f"{platform.python_version()} on {platform.platform()}"),
         *map(_package, needed_packages()),
         _assets(),
         rendering(),
@@ -64,12 +63,6 @@ def examine(config: "RigConfig | None" = None, rig: Path = Path("rig.toml")) -> 
 
 def _is_real(config: "RigConfig | None") -> bool:
     return config is not None and config.backend == "hardware"
-
-
-def _python() -> Finding:
-    ok = sys.version_info >= OLDEST_PYTHON
-    fix = "" if ok else f"install Python {'.'.join(map(str, OLDEST_PYTHON))} or newer"
-    return Finding("python", ok, f"{platform.python_version()} on {platform.platform()}", fix)
 
 
 def needed_packages() -> list[str]:

@@ -18,7 +18,7 @@ from cotarget.emulators.ptu_d46.unit import UnitProfile
 from cotarget.emulators.serve import LOCAL, Closes, Faults, JsonLines
 from cotarget.emulators.world import LiveWorld
 from cotarget.errors import ConfigError, choices
-from cotarget.geometry import RigidTransform, pose
+from cotarget.schema import Pose, model, validate
 
 PREVIEW_SHARE = 2  # the viewfinder's images are smaller than stills by this factor
 QUALITY = 90  # of JPEG, as the simulated cameras have by default
@@ -37,6 +37,14 @@ class Ports:
     zoom: int = 0  # PTP/IP port of the zoom camera
     board: int = 0  # port of the board's holder
     control: int = 0  # port for faults and ground truth
+
+
+@model
+class BoardRequest:
+    """What the board's holder is asked for: the board at a pose or away, or a board that swings about a pose."""
+
+    present: Pose | None = None
+    swing: Pose | None = None
 
 
 class Emulation(Closes):
@@ -155,16 +163,13 @@ class Emulation(Closes):
 
     def _present_board(self, request: Any) -> Any:
         """Answer a request for the board."""
-        (what, wanted), *more = request.items()
-        if more or what not in ("present", "swing"):
-            raise ConfigError(f"unknown request '{what}'; valid here: present, swing")
-        T = None if wanted is None else _parse_pose(wanted)
-        if what == "present":
-            self.world.present(T)
-        elif T is None:
-            raise ConfigError("swing: needs a pose")
+        wanted = validate(BoardRequest, request, "")
+        if wanted.swing is not None:
+            self.world.swing(wanted.swing)
+        elif "present" in request:
+            self.world.present(wanted.present)
         else:
-            self.world.swing(T)
+            raise ConfigError("swing: needs a pose")
         return {"ok": True}
 
     def _control(self, request: Any) -> Any:
@@ -228,13 +233,3 @@ def copied_tables(table: Mapping[str, Any], directory: Path) -> dict[str, Any]:
         if isinstance(copied.get(name, {}).get(key), str):
             copied[name] = {**copied[name], key: str((directory / table[name][key]).resolve())}
     return copied
-
-
-def _parse_pose(wanted: Any) -> RigidTransform:
-    translation, rotvec = ([float(v) for v in wanted[key]] for key in ("translation", "rotvec_deg"))
-    if len(translation) != 3 or len(rotvec) != 3 or not all(map(math.isfinite, translation + rotvec)):
-        raise ConfigError("a pose is {translation: [x, y, z], rotvec_deg: [rx, ry, rz]} of finite numbers")
-    try:
-        return pose(translation, rotvec)
-    except ValueError as error:
-        raise ConfigError(f"a pose's {error}") from None

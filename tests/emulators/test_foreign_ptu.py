@@ -123,7 +123,7 @@ ptu.stream.close()
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="flir-ptu needs telnetlib, which Python 3.13 has no more")
 def test_flir_ptu_moves_reads_back_and_halts():
     command = (sys.executable, "-W", "ignore::DeprecationWarning", "-c", FLIR_PTU)
-    with LiveUnit(D46_PAPER, serial=False, tcp=0) as live, Program(*command, live.ports.url.rpartition(":")[2]) as flir:
+    with LiveUnit(D46_PAPER) as live, Program(*command, live.ports.url.rpartition(":")[2]) as flir:
         pan, tilt = live.pan, live.tilt
         assert flir.result("moved") == [3000, -1500]
         assert (pan.position(), tilt.position()) == (3000, -1500)

@@ -41,11 +41,11 @@ class AxisModel(EmulatedAxis):
 
 
 class LiveUnit:
-    """A PTU-D46 on the machine's own clock behind its ports, which are those of `UnitPorts`; a context manager."""
+    """A PTU-D46 on the machine's own clock behind its ports; a context manager."""
 
-    def __init__(self, unit=D46_STOCK, **ports):
+    def __init__(self, unit=D46_STOCK):
         self.pan, self.tilt, self.faults = AxisModel(), AxisModel(), Faults(D46_FAULTS)
-        self.ports = UnitPorts(D46(self.pan, self.tilt, unit, self.faults, time.monotonic), **ports)
+        self.ports = UnitPorts(D46(self.pan, self.tilt, unit, self.faults, time.monotonic))
 
     def __enter__(self):
         return self
@@ -69,7 +69,7 @@ class D46Unit(LiveUnit):
     """
 
     def __init__(self, profile=D46_STOCK, tcp=False):
-        super().__init__(profile, serial=not tcp, tcp=0 if tcp else None)
+        super().__init__(profile)
         step = profile.step / 3600
         self.config = D46Settings(
             port=self.ports.url if tcp else self.ports.port,

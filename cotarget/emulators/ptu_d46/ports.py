@@ -1,4 +1,4 @@
-"""Ports of the emulated PTU-D46: a pseudo-terminal, TCP, or both, served by one thread.
+"""Ports of the emulated PTU-D46: a pseudo-terminal and TCP, served by one thread.
 
 `Wire` gives every byte its time on the serial line, ten bits at the baud rate, in each direction. Times are planned
 ahead of the clock, so that a thread that wakes late does not slow the line.
@@ -6,10 +6,8 @@ ahead of the clock, so that a thread that wakes late does not slow the line.
 
 import contextlib
 import os
-import random
 import select
 import socket
-import termios
 import threading
 import time
 import tty
@@ -19,11 +17,10 @@ from cotarget.emulators.ptu_d46.firmware import D46
 from cotarget.emulators.serve import LOCAL, Closes, open_listener
 from cotarget.errors import DeviceError
 
-BAUD, BITS = 9600, 10  # factory setting of the line; bits of a byte: start, eight, stop
+BYTE_S = 10 / 9600  # time of a byte, start, eight bits and stop, at the factory setting of the line [s]
 TICK_S = 0.005  # period of asking an idle firmware for output, and of checking whether the ports close [s]
 RECEIVE = 4096  # bytes
 SEND_TIMEOUT_S = 1.0  # a TCP client that reads nothing for this time is dropped [s]
-SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 
 
 class Wire:
@@ -31,31 +28,26 @@ class Wire:
 
     def __init__(self, firmware: D46) -> None:
         self._firmware = firmware
-        self._noise = random.Random(0)
-        self._in: deque[tuple[float, int, int | None]] = deque()
+        self._in: deque[tuple[float, int]] = deque()
         self._out: deque[tuple[float, int]] = deque()
         self._in_free = self._out_free = 0.0
 
-    def feed(self, data: bytes, now: float, baud: int | None = None) -> None:
-        """Put bytes from the client on the wire now [s].
-
-        If the client's baud rate differs from the unit's, noise arrives; None is the unit's own.
-        """
+    def feed(self, data: bytes, now: float) -> None:
+        """Put bytes from the client on the wire now [s]."""
         for byte in data:
-            self._in_free = max(self._in_free, now) + BITS / (baud or BAUD)
-            self._in.append((self._in_free, byte, baud))
+            self._in_free = max(self._in_free, now) + BYTE_S
+            self._in.append((self._in_free, byte))
 
-    def step(self, now: float, baud: int | None = None) -> bytes:
-        """Pass to the firmware the bytes that have arrived; return those at a client with this baud rate."""
+    def step(self, now: float) -> bytes:
+        """Pass to the firmware the bytes that have arrived; return those that have arrived at the client."""
         while self._in and self._in[0][0] <= now:
-            arrived, byte, sent_at = self._in.popleft()
-            self._firmware.receive(bytes([byte]) if sent_at in (None, BAUD) else self._noise.randbytes(1))
+            arrived, byte = self._in.popleft()
+            self._firmware.receive(bytes([byte]))
             self._collect(arrived)
         self._collect(now)
         due = bytearray()
         while self._out and self._out[0][0] <= now:
-            _, byte = self._out.popleft()
-            due += bytes([byte]) if baud in (None, BAUD) else self._noise.randbytes(1)
+            due.append(self._out.popleft()[1])
         return bytes(due)
 
     def due(self) -> float | None:
@@ -71,34 +63,32 @@ class Wire:
     def _collect(self, ready: float) -> None:
         """Put the firmware's output on the wire."""
         for byte in self._firmware.output():
-            self._out_free = max(self._out_free, ready) + BITS / BAUD
+            self._out_free = max(self._out_free, ready) + BYTE_S
             self._out.append((self._out_free, byte))
 
 
 class UnitPorts(Closes):
     """The ports of a unit, which serve one program at a time; a context manager.
 
-    The pseudo-terminal behaves as a serial port: a client with another baud rate than the unit exchanges noise with it.
     The TCP port is as of a serial device server. While it has a client, the pseudo-terminal is not served. A second
     client replaces the first, because one that vanished, such as by a pulled cable, would otherwise block the unit for
     ever. While the fault unplugged is on, there are no ports; afterwards the pseudo-terminal may have another name.
 
     Args:
         firmware: the unit.
-        serial: whether there is a pseudo-terminal.
-        tcp: TCP port to listen at, 0 for any free one; None for none.
+        tcp: TCP port to listen at, 0 for any free one.
         host: address to listen at.
 
     Raises:
         DeviceError: the address is invalid or in use, or the machine has no pseudo-terminal left.
     """
 
-    def __init__(self, firmware: D46, *, serial: bool = True, tcp: int | None = None, host: str = LOCAL) -> None:
-        self._firmware, self._wire, self._serial = firmware, Wire(firmware), serial
+    def __init__(self, firmware: D46, *, tcp: int = 0, host: str = LOCAL) -> None:
+        self._firmware, self._wire = firmware, Wire(firmware)
         self._ends: tuple[int, int] | None = None  # emulator's and client's end; the latter stays open here too,
         self.port = ""  # because without any open client's end the emulator's fails
-        self._listener = None if tcp is None else open_listener(host, tcp)
-        self._address = None if self._listener is None else (host, int(self._listener.getsockname()[1]))
+        self._listener: socket.socket | None = open_listener(host, tcp)
+        self._address = host, int(self._listener.getsockname()[1])
         self._client: socket.socket | None = None
         try:
             self._plug_in()
@@ -112,7 +102,6 @@ class UnitPorts(Closes):
     @property
     def url(self) -> str:
         """URL of the TCP port for pyserial and rig.toml."""
-        assert self._address is not None
         return "socket://{}:{}".format(*self._address)
 
     def close(self) -> None:
@@ -136,16 +125,10 @@ class UnitPorts(Closes):
         self._unplug()
 
     def _plug_in(self) -> None:
-        if self._address is not None and self._listener is None:
-            self._listener = open_listener(*self._address)
-        if not self._serial:
-            return
+        self._listener = self._listener or open_listener(*self._address)
         master, slave = os.openpty()
         tty.setraw(master)
         tty.setraw(slave)
-        attributes = termios.tcgetattr(slave)
-        attributes[4] = attributes[5] = termios.B9600
-        termios.tcsetattr(slave, termios.TCSANOW, attributes)
         os.set_blocking(master, False)
         self._ends, self.port = (master, slave), os.ttyname(slave)
 
@@ -163,8 +146,7 @@ class UnitPorts(Closes):
 
     def _exchange(self) -> None:
         """Pass on the bytes that are due, and wait for more, or for a client."""
-        now, baud = time.monotonic(), self._baud()
-        if arrived := self._wire.step(now, baud):
+        if arrived := self._wire.step(time.monotonic()):
             self._send(arrived)
         due = self._wire.due()
         timeout = TICK_S if due is None else min(max(due - time.monotonic(), 0.0), TICK_S)
@@ -178,13 +160,7 @@ class UnitPorts(Closes):
                 with contextlib.suppress(BlockingIOError):
                     data = os.read(source, RECEIVE)
                     if self._client is None:
-                        self._wire.feed(data, time.monotonic(), self._baud())
-
-    def _baud(self) -> int | None:
-        """Return the baud rate that the program at the pseudo-terminal has set; None for a line without one."""
-        if self._client is not None or self._ends is None:
-            return None
-        return SPEEDS.get(termios.tcgetattr(self._ends[1])[5]) or None
+                        self._wire.feed(data, time.monotonic())
 
     def _send(self, data: bytes) -> None:
         if self._client is not None:
