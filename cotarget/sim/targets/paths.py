@@ -44,32 +44,21 @@ class Path:
 
     def position(self, t: float) -> Array:
         """Give the position at time t [s], (3,) [m]."""
-        (a, b, c, d), s = self._piece(self.within(t))
-        return ((a * s + b) * s + c) * s + d
-
-    def velocity(self, t: float) -> Array:
-        """Give the velocity at time t [s], (3,) [m/s]; beyond the path's ends, the velocity just inside them."""
-        first, last = self._knots[0], self._knots[-1]
-        inside = 1e-3 * (last - first)
-        (a, b, c, _), s = self._piece(min(max(self.within(t), first + inside), last - inside))
-        return (3 * a * s + 2 * b) * s + c
-
-    def acceleration(self, t: float) -> Array:
-        """Give the acceleration at time t [s], (3,) [m/s^2]."""
-        (a, b, _, _), s = self._piece(self.within(t))
-        return 6 * a * s + 2 * b
+        return np.array(self.motion(t)[0])
 
     def motion(self, t: float) -> tuple[list[float], list[float], list[float]]:
-        """Give position [m], velocity [m/s] and acceleration [m/s^2], (3,) each, as floats; faster than one by one."""
-        first, last = self._knots[0], self._knots[-1]
-        inside = 1e-3 * (last - first)
-        at = self.within(t)
-        if not first + inside <= at <= last - inside:  # the target is at an end of the path
-            return self.position(t).tolist(), self.velocity(t).tolist(), self.acceleration(t).tolist()
-        piece, s = self._piece(at)
-        axes = list(zip(*piece.tolist(), strict=True))
+        """Give position [m], velocity [m/s] and acceleration [m/s^2], (3,) each, as floats, at time t [s].
+
+        Beyond the path's ends, the velocity is that just inside them.
+        """
+        at, first, last = self.within(t), self._knots[0], self._knots[-1]
+        axes, s = self._piece(at)
         x = [((a * s + b) * s + c) * s + d for a, b, c, d in axes]
-        return x, [(3 * a * s + 2 * b) * s + c for a, b, c, _ in axes], [6 * a * s + 2 * b for a, b, _, _ in axes]
+        acceleration = [6 * a * s + 2 * b for a, b, _, _ in axes]
+        inside = 1e-3 * (last - first)
+        if not first + inside <= at <= last - inside:
+            axes, s = self._piece(min(max(at, first + inside), last - inside))
+        return x, [(3 * a * s + 2 * b) * s + c for a, b, c, _ in axes], acceleration
 
     @cached_property
     def _knots(self) -> list[float]:
@@ -77,13 +66,13 @@ class Path:
 
     @cached_property
     def _pieces(self) -> Array:
-        """Coefficients of each cubic piece, highest power first, (pieces, 4, 3)."""
-        return np.ascontiguousarray(np.moveaxis(self.spline.c, 1, 0))
+        """Coefficients of each cubic piece, highest power first, (pieces, 3, 4)."""
+        return np.ascontiguousarray(np.transpose(self.spline.c, (1, 2, 0)))
 
-    def _piece(self, t: float) -> tuple[Array, float]:
-        """Give the cubic piece at a time on the spline, (4, 3), and the time since its start."""
+    def _piece(self, t: float) -> tuple[list[list[float]], float]:
+        """Give the cubic piece at a time on the spline, four coefficients an axis, and the time since its start."""
         i = min(bisect_right(self._knots, t) - 1, len(self._pieces) - 1)
-        return self._pieces[i], t - self._knots[i]
+        return self._pieces[i].tolist(), t - self._knots[i]
 
     def travelled(self, t: float) -> float:
         """Give the distance since the path's start at time t [s], [m]."""
