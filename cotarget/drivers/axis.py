@@ -236,7 +236,8 @@ class VideoServer:
             asked = f"camera {config.camera}, resolution '{config.resolution}', compression {config.compression}"
             target = self.quote(response.headers.get("location", ""))
             sent = f"{status}, it sends on to {target}" if target else f"{status}"
-            return StreamRefusedError(f"{name} refuses {asked} ({sent}): check hardware.fixed.camera and url")
+            check = "check hardware.fixed.camera, resolution and url"
+            return StreamRefusedError(f"{name} refuses {asked} ({sent}): {check}")
         kind = self.quote(response.headers.get("content-type", "")) or "something"
         said = self.quote(self.read(response)) if kind.lower().startswith("text/plain") else ""
         said = f" '{said}'" if said else ""

@@ -263,10 +263,8 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
     """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"{path.parent}: is no recording: it holds no {path.name}") from None
-    except NotADirectoryError:
-        raise ConfigError(f"{path.parent}: is a file; give the folder of a recording") from None
+    except (FileNotFoundError, NotADirectoryError):
+        raise ConfigError(f"{path.parent}: is no folder of a recording: it holds no {path.name}") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise ConfigError(f"{path}: cannot be read: {reason}") from None
@@ -362,8 +360,6 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
     Raises:
         ConfigError: the folder is no recording, has another schema, or holds nothing that can be replayed.
     """
-    if not directory.exists():
-        raise ConfigError(f"{directory}: no such folder; give the folder of a recording")
     meta = _read_meta(directory / META)
     target, selector_table, config = _parse_meta(directory, meta)
     if not (directory / CALIBRATION).is_file():

@@ -313,8 +313,6 @@ class Recorder(contextlib.AbstractContextManager["Recorder", None]):
         """
         self._directory = directory
         self._wrapped = False
-        if directory.is_file():
-            raise ConfigError(f"{directory}: is a file; give a new folder for the recording")
         try:
             self._made = not directory.exists()
             directory.mkdir(parents=True, exist_ok=True)
