@@ -56,7 +56,7 @@ class AxisFacts:
         return abs(position - other) <= self.slack + self.same
 
     def braking_s(self, speed: float) -> float:
-        """Time to come to rest from a speed [1/s] [s]."""
+        """Time [s] to come to rest from a speed [1/s]."""
         return USUAL_BRAKING_S if self.acceleration is None else speed / self.acceleration
 
     def goal(self, angle: float, sign: int) -> float:
