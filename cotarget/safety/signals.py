@@ -8,12 +8,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from cotarget.errors import ConfigError
-
-if TYPE_CHECKING:
-    from cotarget.safety.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
 
@@ -24,11 +21,29 @@ FREEZING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTT
 SHELL_STATUS = 128  # a shell's exit status for a signal is this plus its number
 
 
+class GuardedHead(Protocol):
+    """A head that signal handlers halt, see `cotarget.safety.watchdog.Watchdog`."""
+
+    in_main_thread: bool  # whether the main thread opened it, or gave its last command
+
+    def refuse(self, reason: str) -> None:
+        """Refuse moves."""
+
+    def stop(self, reason: str) -> None:
+        """Halt the head, and refuse moves."""
+
+    def halt(self) -> None:
+        """Halt the head; raises as the device does."""
+
+    def held(self) -> contextlib.AbstractContextManager[None]:
+        """Let no command begin in the block."""
+
+
 class _Process:
     """The signal handlers of this process, and the heads that they halt."""
 
     def __init__(self) -> None:
-        self.heads: list[Watchdog] = []
+        self.heads: list[GuardedHead] = []
         self.handled = False  # whether `handle_signals` was called
         self._undo: Callable[[], None] | None = None
 
@@ -38,7 +53,7 @@ class _Process:
             ending = dict.fromkeys((signal.SIGINT, *ENDING), self._end)
             self._undo = _install(ending | dict.fromkeys(FREEZING, self._freeze))
 
-    def remove(self, head: "Watchdog") -> None:
+    def remove(self, head: GuardedHead) -> None:
         """Forget a head; remove the handlers after the last one, but for those of `handle_signals`."""
         self.heads = [each for each in self.heads if each is not head]
         if self._undo is not None and not (self.heads or self.handled) and is_main_thread():
@@ -91,7 +106,7 @@ def handle_signals() -> None:
     _PROCESS.handled = True
 
 
-def guard_head(head: "Watchdog") -> Callable[[], None]:
+def guard_head(head: GuardedHead) -> Callable[[], None]:
     """Have the signal handlers halt a head until the returned function is called.
 
     A signal that would end the process raises SystemExit in the main thread, so that its ``with`` blocks are left, and

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from cotarget.config import SafetyConfig
 from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.rig import Clock, PanTilt, PanTiltLimits, PanTiltState
+from cotarget.safety.signals import is_main_thread
 from cotarget.safety.stop_file import StopLook, stop_reason, stopped_by_file
 
 log = logging.getLogger(__name__)
@@ -62,8 +63,7 @@ class Watchdog:
     """
 
     def __init__(self, head: PanTilt, clock: Clock, config: SafetyConfig, *, threaded: bool) -> None:
-        self.threaded, self.logged = threaded, ""
-        self.in_main_thread = threading.current_thread() is threading.main_thread()
+        self.threaded, self.logged, self.in_main_thread = threaded, "", is_main_thread()
         self._is_inside: bool | None = None  # whether the last state was within the soft limits
         self._head, self._clock = head, clock
         self._timeout_s = config.watchdog_s
@@ -99,7 +99,7 @@ class Watchdog:
                 raise DeviceError(f"the head does not move before it could be halted: {self._owed}")
             self._alive_at = self._called_t = self._clock.now()
             self._motion = Motion(goal, self._alive_at, halts, patience_s)
-            self.in_main_thread = threading.current_thread() is threading.main_thread()
+            self.in_main_thread = is_main_thread()
             return self._motion
 
     def end(self, motion: Motion, arrived: bool) -> bool:
