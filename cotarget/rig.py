@@ -181,7 +181,8 @@ class PanTiltLimits:
             DeviceError: a speed is not above zero.
         """
         capped = []
-        for each, axis in zip(speed if isinstance(speed, tuple) else (speed, speed), self.axes, strict=True):
+        pair = speed if isinstance(speed, tuple) else (speed, speed)
+        for each, axis in zip(pair, (self.pan, self.tilt), strict=True):
             if each is not None and not each > 0:
                 raise DeviceError(f"the head cannot move at a speed of {each} rad/s")
             capped.append(axis.speed if each is None else min(each, axis.speed))
