@@ -50,6 +50,7 @@ class Move:
     speeds: Pair
     wait: bool = False  # whether the caller waits for the end, and so receives the error
     deadline: float | None = None  # time by which the head should have arrived [s]; None until the move is sent
+    rests_by: float | None = None  # time by which a head that is late at its goal should stand there [s]
     cuts: int = 0  # how often the move was sent again after the line was silent
     error: DeviceError | None = None  # why the head did not arrive
     done: threading.Event = field(default_factory=threading.Event)  # set when the head has arrived, or will not
@@ -444,7 +445,7 @@ class Loop:
                 self.snapshot = self._see(self._head)
                 move.finish()
             elif min(track.newest.t for track in self._head) > move.deadline:  # a late thread alone does not count
-                self._refuse_stalled(move)
+                self._refuse_late(move, min(track.newest.t for track in self._head))
             else:
                 self._renew(move)
         self._check_lens()
@@ -506,8 +507,16 @@ class Loop:
         goals = zip(self._head, move.goals, strict=True)
         return [track for track, goal in goals if not track.facts.is_near(track.newest.position, goal)]
 
-    def _refuse_stalled(self, move: Move) -> None:
-        """End a move that did not arrive in time; raise where an axis may have lost its position."""
+    def _refuse_late(self, move: Move, t: float) -> None:
+        """End a move that did not arrive in time; raise where an axis may have lost its position.
+
+        Args:
+            move: the move, whose deadline is over.
+            t: time of the polls [s]. After a pause of the program the first ones show the head at its goal.
+        """
+        if not self._off_goal(move) and (move.rests_by is None or t <= move.rests_by):
+            move.rests_by = move.rests_by or t + PATIENCE_S
+            return
         pan, tilt = (f"{track.newest.position:g}" for track in self._head)
         wanted = ", ".join(f"{goal:g}" for goal in move.goals)
         what = f"did not arrive in time: pan {pan}, tilt {tilt}, where {wanted} were commanded; it was halted"

@@ -186,7 +186,7 @@ FIRST = {
     ),
     "stop --rig sim.toml": 'sim.toml: has no stop file; give one: [safety] stop_file = "stop"',
     "view": "this machine has no display; --browser shows the scene in a web browser instead",
-    "replay none": "none: no such folder; give the folder of a recording",
+    "replay none": "none: is no folder of a recording: it holds no recording.json",
 }
 OPENED = [
     (f"{FOLLOW} --video out.xyz", FAILED, "out.xyz: ", ".mp4"),

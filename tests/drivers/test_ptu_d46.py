@@ -512,7 +512,7 @@ ENDS = {
         PositionLostError,
         "pan hit its limit",
     ),
-    "does not arrive": (stuck, PositionLostError, r"pan \d+, tilt 0 steps, where 3000, 0"),
+    "does not arrive": (stuck, PositionLostError, r"pan \d+, tilt 0, where 3000, 0"),
     **{
         f"!{axis} {how}": (act, PositionLostError, EVENTS[axis])
         for axis in EVENTS

@@ -76,7 +76,7 @@ class Blind:
 def looked(world, until, seconds):
     """Where a camera's head was sent that sees its book until a time, by what it was doing; and its focal lengths."""
     truth, calibration = world.truth(), true_calibration(world)
-    detector = Blind(Outlines(truth, still=True), until)
+    detector = Blind(Outlines(truth), until)
     delay = world.rig.spec.head.delay_s
     field = scan_of(world.rig, calibration)
     camera = LoneCamera(world.rig, truth, calibration, BOOK, detector, delay, 0.5, field)
