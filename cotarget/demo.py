@@ -7,6 +7,7 @@ Calibration, runs and evaluation follow each other, each in its own process, bec
 
 import dataclasses
 import json
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +31,7 @@ FRONT_DEG, BACK_DEG = -62.0, 118.0  # directions of the two pictures of the rig
 CALIBRATION = "calibration.json"
 
 UNFINISHED = ".unfinished-"  # prefix of the folder in which a run works
+ABANDONED_S = 3600.0  # age from which such a folder is taken to be left by a killed run
 
 
 def run_demo(out: Path, seed: int, progress: Progress) -> dict[str, Any]:
@@ -75,6 +77,9 @@ def finished_together(out: Path) -> Iterator[Path]:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
+        for left in out.glob(f"{UNFINISHED}*"):  # by a killed run
+            if time.time() - left.stat().st_mtime > ABANDONED_S:
+                shutil.rmtree(left, ignore_errors=True)
         work = TemporaryDirectory(dir=out, prefix=UNFINISHED)
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written to: {error.strerror}; name a folder that can") from None

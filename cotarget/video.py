@@ -106,7 +106,8 @@ class Film(contextlib.AbstractContextManager["Film", None]):
     def __iter__(self) -> Iterator[Frame]:
         """Decode the frames in order; times are the film's own [s], or from the frame rate if it has none.
 
-        A wild time stamp, which is not between those of its neighbours, is replaced, and a warning says so.
+        A single wild time stamp, which is not between those of its neighbours, is replaced, and a warning says so; the
+        first and the last one, and two in a row, stay as they are.
 
         Raises:
             CotargetError: nothing can be decoded, or the image's size changes.

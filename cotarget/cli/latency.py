@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
             found[name] = None
             failed.append(str(error) if name in str(error) else f"{name}: {error}")
 
-    with open_named(options.rig, config, partial=True) as rig:
+    with open_named(options.rig, config, partial=calibration is None) as rig:
         head = measure_head(rig)
         agreement["zoom"] = head.zoom.agreement
         keep(f"{zoom_table}.latency_s", lambda: rig.spec.zoom.latency_s + head.zoom.seconds)
@@ -59,11 +59,15 @@ def run(options: argparse.Namespace) -> None:
         if where == "hardware" and not one:  # otherwise the lens has the head's command delay
             keep("hardware.zoom.command_delay_s", lambda: measure_lens(rig, head.zoom.seconds))
         if calibration is not None:
-            fixed = measure_fixed(rig, calibration, config.board)
-            agreement["fixed"] = fixed.agreement
-            # Relative to the zoom camera, whose frame times contain the error found above.
-            found_s = rig.spec.fixed.latency_s + fixed.seconds + head.zoom.seconds
-            keep(f"{where}.fixed.latency_s", lambda: found_s)
+            known = calibration
+
+            def measure() -> float:
+                fixed = measure_fixed(rig, known, config.board)
+                agreement["fixed"] = fixed.agreement
+                # Relative to the zoom camera, whose frame times contain the error found above.
+                return rig.spec.fixed.latency_s + fixed.seconds + head.zoom.seconds
+
+            keep(f"{where}.fixed.latency_s", measure)
     if calibration is None:
         print("the fixed camera's latency needs --calibration, to look at a board with both cameras", file=sys.stderr)
     if head.late:

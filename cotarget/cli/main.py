@@ -116,7 +116,10 @@ def _prepare(name: str) -> None:
     """Let a standard stream write any name; replace a closed one, whose descriptor the next file would get."""
     stream = getattr(sys, name)
     if stream is None:
-        setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115  open until the program ends
+        descriptor = {"stdout": 1, "stderr": 2}[name]
+        if (opened := os.open(os.devnull, os.O_WRONLY)) != descriptor:  # a closed stdin's came first
+            os.dup2(opened, descriptor)
+        setattr(sys, name, open(descriptor, "w"))  # noqa: PTH123, SIM115  open until the program ends
     elif isinstance(stream, io.TextIOWrapper):
         stream.reconfigure(errors="backslashreplace")
 

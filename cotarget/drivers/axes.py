@@ -124,10 +124,11 @@ class AxisTrack:
         """Add a poll.
 
         Raises:
-            DeviceError: the position is no number.
+            DeviceError: the position is no number, or its standard deviation is none.
         """
-        if not math.isfinite(poll.position):
-            raise DeviceError(f"{AXES[poll.axis]} is reported to be at {poll.position}; correct the driver")
+        if not (math.isfinite(poll.position) and 0 <= poll.sigma < math.inf):
+            what = f"at {poll.position}, with a standard deviation of {poll.sigma}"
+            raise DeviceError(f"{AXES[poll.axis]} is reported to be {what}; correct the driver")
         if poll.t < self._valid or poll.moving:
             self._since = None
         elif self._since is None or not self._stays(poll.position):

@@ -230,14 +230,21 @@ class VideoServer:
         if status in (401, 403):
             check = f"check hardware.fixed.user and the password, which may be in {config.password_env}"
             return LoginError(f"{name} refuses the user '{self._user}' ({status}): {check}")
+        if status == 503:
+            return BusyError(f"{name} is busy (503), perhaps with too many viewers: close some")
         if status >= 500:
-            return BusyError(f"{name} is busy or fails ({status}), perhaps with too many viewers: close some")
+            return BusyError(f"{name} fails with status {status}: restart it if that lasts")
+        if 300 <= status < 400:
+            target = self.quote(response.headers.get("location", "another address"))
+            return StreamRefusedError(
+                f"{name} sends on to {target}: set hardware.fixed.url to where the server really is"
+            )
+        if status == 404:
+            check = "check hardware.fixed.url and hardware.fixed.camera"
+            return StreamRefusedError(f"{name} has no {STREAM_PATH} for camera {config.camera} (404): {check}")
         if status != 200:
             asked = f"camera {config.camera}, resolution '{config.resolution}', compression {config.compression}"
-            target = self.quote(response.headers.get("location", ""))
-            sent = f"{status}, it sends on to {target}" if target else f"{status}"
-            check = "check hardware.fixed.camera, resolution and url"
-            return StreamRefusedError(f"{name} refuses {asked} ({sent}): {check}")
+            return StreamRefusedError(f"{name} refuses {asked} ({status}): check them in hardware.fixed")
         kind = self.quote(response.headers.get("content-type", "")) or "something"
         said = self.quote(self.read(response)) if kind.lower().startswith("text/plain") else ""
         said = f" '{said}'" if said else ""
@@ -367,6 +374,8 @@ def _import_httpx() -> ModuleType:
 
 # Time limit for the first image; a busy server is asked again until then [s].
 OPEN_S = 5.0
+# Images of a live camera differ by their noise; a stream that repeats one image for this time is frozen [s].
+FROZEN_S = 1.0
 # A stream that brings bytes but no whole image is opened again after this multiple of `silence_s`.
 FRUITLESS_SILENCES = 2.0
 
@@ -403,12 +412,14 @@ class AxisCamera(BufferedCamera):
         self._config, self._clock = config, clock
         self._server = VideoServer(config)
         self._api = ""
+        self._open = False
+        self._asked: int | None = None  # number of frames when the server was asked for its video signal
         name = f"the fixed camera at {self._server.name}"
         self._frames = FrameBuffer(name, clock, config.size, config.latency_s, self._server.silence_s)
         import_simplejpeg()
         try:
             self._api = self._server.check().get("Properties.API.HTTP.Version", "")
-            self._frames.start(lambda: self._frames.keep_open(self._stream), "axis")
+            self._frames.start(lambda: self._frames.keep_open(self._stream, self._ask_for_video), "axis")
             width, height = self._frames.first(OPEN_S)
             if (width, height) != config.size:
                 raise ConfigError(
@@ -428,7 +439,9 @@ class AxisCamera(BufferedCamera):
 
     def _stream(self) -> None:
         """Open the stream and take its images until it ends."""
+        self._open = False
         with self._server.stream(self._api) as (boundary, pieces):
+            self._open = True
             self._frames.opened()
             self._drain(MultipartReader(boundary), pieces)
 
@@ -447,5 +460,21 @@ class AxisCamera(BufferedCamera):
                 fruitful = now if pictures else fruitful
                 if now - fruitful > FRUITLESS_SILENCES * self._server.silence_s:
                     raise DeviceError(f"{self._server.name} sends no whole pictures")
+                if self._frames.frozen_s > FROZEN_S and self._asked != self.counts.frames:
+                    # The server is asked for its signal after this stream is closed: a stream that is not drained
+                    # meanwhile would give the next image a wrong time.
+                    raise DeviceError(f"{self._server.name} repeats the same picture")
         finally:
             self._frames.refuse(reader.broken - broken + reader.unfinished)
+
+    def _ask_for_video(self) -> None:
+        """Ask once, where a stream has ended and images have not come for a while, whether the input has a signal."""
+        frames = self.counts.frames
+        if not self._open or self._frames.waited_s <= FROZEN_S or self._asked == frames:
+            return
+        video = None
+        with contextlib.suppress(DeviceError):  # the stream's own error is reported already
+            video = self._server.has_video()
+        self._asked = frames
+        if video is False:
+            self._frames.remark(f"its input {self._config.camera} has no video")

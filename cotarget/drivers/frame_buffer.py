@@ -11,7 +11,7 @@ the stream ends. Callers get errors from `read`.
 import logging
 import threading
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,17 @@ class StreamRefusedError(DeviceError):
     """The camera refuses this stream."""
 
 
+@dataclass(frozen=True)
+class FrameCounts:
+    """Frame counts of a camera."""
+
+    frames: int = 0  # new frames
+    skipped: int = 0  # new frames that were not read before the next one came
+    repeated: int = 0  # frames equal to the one before
+    refused: int = 0  # damaged, cut short or late frames; damage inside of a JPEG is only seen when it is read
+    reconnects: int = 0  # number of times that the stream was opened again
+
+
 @dataclass(eq=False)
 class _Newest:
     """The newest frame: as it came, and decoded once it has been read."""
@@ -48,6 +59,7 @@ class _Newest:
     arrived: float
     before: float  # arrival of the frame before [s]
     image: Image | None = None
+    read: bool = False
 
 
 class FrameBuffer:
@@ -73,7 +85,7 @@ class FrameBuffer:
         self._decoding = threading.Lock()
         # Guards everything below, which is shared with the camera's thread.
         self._changed = threading.Condition()
-        self._frames = self._refusals = 0  # numbers of new frames, and of damaged, cut short or late ones
+        self._counts = FrameCounts()
         self._newest: _Newest | None = None
         self._last: Hashable = None  # what tells the newest frame from a repeated one, even if it cannot be decoded
         self._new_at = self._heard_at = clock.now()  # arrival of the newest frame, and of anything
@@ -100,7 +112,7 @@ class FrameBuffer:
         self._thread = threading.Thread(target=run, name=name, daemon=True)
         self._thread.start()
 
-    def keep_open(self, stream: Callable[[], None]) -> None:
+    def keep_open(self, stream: Callable[[], None], after: Callable[[], None] = lambda: None) -> None:
         """Call ``stream``, which opens the camera and puts its frames, again whenever it ends, until `close`.
 
         Pauses grow while no frame comes. An error before the camera was ever open ends `first`, unless it is a
@@ -108,17 +120,20 @@ class FrameBuffer:
 
         Args:
             stream: returns or raises DeviceError at the end of the stream.
+            after: called after each end of the stream.
         """
         pause = 0.0
         while not self._closing.wait(pause):
-            frames = self._frames
+            frames = self.counts.frames
             error = DeviceError(f"{self.name} has closed the stream")
             try:
                 stream()
             except DeviceError as raised:
                 error = raised
+            worked = self.counts.frames > frames
             self.lose(error)
-            worked = self._frames > frames
+            if not self.closing:
+                after()
             pause = SHORTEST_PAUSE_S if worked else min(max(2 * pause, SHORTEST_PAUSE_S), LONGEST_PAUSE_S)
             if isinstance(error, StreamRefusedError):
                 pause = REFUSED_PAUSE_S
@@ -126,6 +141,8 @@ class FrameBuffer:
     def opened(self) -> None:
         """Record that the stream is open."""
         with self._changed:
+            again = 1 if self._was_open else 0
+            self._counts = replace(self._counts, reconnects=self._counts.reconnects + again)
             self._heard_at, self._lost, self._was_open = self._clock.now(), "", True
 
     def heard(self) -> None:
@@ -155,13 +172,16 @@ class FrameBuffer:
             own = t if serial is None else serial
             own = data if own is None and not isinstance(data, np.ndarray) else own
             if own is not None and own == self._last:
+                self._counts = replace(self._counts, repeated=self._counts.repeated + 1)
                 self._frozen = True
                 return False
             self._last = own
             if took > self._fresh_s:
                 self._refuse(f"its frames take {took:.2g} s to come", 1)
                 return True
-            self._frames += 1
+            skipped = 1 if self._newest is not None and not self._newest.read else 0
+            counts = self._counts
+            self._counts = replace(counts, frames=counts.frames + 1, skipped=counts.skipped + skipped)
             self._newest = _Newest(data, arrived - self._latency_s if t is None else t, arrived, self._new_at)
             self._new_at = arrived
             self._frozen, self._refused, self._remark, self._lost = False, "", "", ""
@@ -196,6 +216,12 @@ class FrameBuffer:
     # Calls of any thread
 
     @property
+    def counts(self) -> FrameCounts:
+        """Frame counts so far."""
+        with self._changed:
+            return self._counts
+
+    @property
     def gone(self) -> str:
         """Why no frame will come any more; empty while frames may come."""
         return self._gone
@@ -204,6 +230,12 @@ class FrameBuffer:
     def closing(self) -> bool:
         """Whether `close` was called."""
         return self._closing.is_set()
+
+    @property
+    def frozen_s(self) -> float:
+        """Time for which the same frame has been repeated [s]."""
+        with self._changed:
+            return self._heard_at - self._new_at if self._frozen else 0.0
 
     @property
     def waited_s(self) -> float:
@@ -255,6 +287,7 @@ class FrameBuffer:
                 newest = self._newest
                 if newest is None or not self._ready(newer_than, begin):
                     raise StaleFrameError(self._why(timeout))
+                newest.read = True
             image = self._decode(newest)
             if image is None:
                 continue
@@ -306,7 +339,7 @@ class FrameBuffer:
 
     def _refuse(self, why: str, count: int) -> None:
         self._refused = why
-        self._refusals += count
+        self._counts = replace(self._counts, refused=self._counts.refused + count)
 
     def _why(self, timeout: float) -> str:
         """Explain why there is no newer frame."""
@@ -316,7 +349,7 @@ class FrameBuffer:
         elif now - self._heard_at > QUIET_S:
             reason = f"{self.name} has sent nothing for {now - self._heard_at:.1f} s"
         elif self._refused:
-            reason = f"{self._refused}, {self._refusals} so far"
+            reason = f"{self._refused}, {self._counts.refused} so far"
         elif self._frozen:
             reason = f"{self.name} repeats the same picture"
         elif self._remark:
@@ -336,6 +369,11 @@ class BufferedCamera:
     def size(self) -> tuple[int, int]:
         """(width, height) of the frames [px]."""
         return self._frames.size
+
+    @property
+    def counts(self) -> FrameCounts:
+        """Frame counts so far."""
+        return self._frames.counts
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
         """Wait for a frame, see `FrameBuffer.read`."""

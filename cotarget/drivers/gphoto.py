@@ -152,8 +152,10 @@ def check_permission(port: str) -> None:
 
 def closest(names: Iterable[str], wanted: str, most: int = 12) -> str:
     """List valid choices for a message, those most like ``wanted`` first, at most ``most`` of them."""
-    names = set(names)
-    shown = difflib.get_close_matches(wanted, sorted(names), n=most, cutoff=0.0)
+    names = sorted(set(names))
+    near = [name for name in names if wanted.lower() in name.lower()]
+    near += difflib.get_close_matches(wanted, names, n=most, cutoff=0.4)
+    shown = list(dict.fromkeys([*near, *names]))[:most]
     more = len(names) - len(shown)
     return (", ".join(shown) or "none") + (f" and {more} more" if more else "")
 
@@ -193,7 +195,7 @@ class LinkError(Exception):
 class Setting:
     """A setting of a camera."""
 
-    kind: Literal["range", "switch", "choice", "text"]  # a switch is 0 or 1
+    kind: Literal["range", "switch", "choice", "date", "text"]  # a switch is 0 or 1, a date in seconds since 1970
     value: str | float  # the present one
     low: float = 0.0  # of a range
     high: float = 0.0
@@ -300,7 +302,9 @@ class GphotoLink:
             return Setting("choice", str(value), choices=choices, readonly=readonly)
         if kind == gp.GP_WIDGET_TOGGLE:
             return Setting("switch", float(value), choices=("0", "1"), readonly=readonly)
-        return Setting("text", str(value), readonly=readonly or kind == gp.GP_WIDGET_DATE)
+        if kind == gp.GP_WIDGET_DATE:
+            return Setting("date", float(value), readonly=readonly)
+        return Setting("text", str(value), readonly=readonly)
 
     def put(self, name: str, value: str | float) -> None:
         """Write a setting."""
@@ -308,7 +312,7 @@ class GphotoLink:
         kind = widget.get_type()
         if kind == gp.GP_WIDGET_RANGE:
             widget.set_value(float(value))
-        elif kind == gp.GP_WIDGET_TOGGLE:
+        elif kind in (gp.GP_WIDGET_TOGGLE, gp.GP_WIDGET_DATE):
             widget.set_value(int(value))
         else:
             widget.set_value(str(value))

@@ -132,6 +132,7 @@ SHOOTING, TARGET, MEMORY = "capture", "capturetarget", "Internal RAM"
 # -2 means busy or a wrong value; values are checked against the setting's range before, so that here it means busy.
 BUSY = frozenset({BAD_PARAMETERS, CAMERA_BUSY})
 BUSY_PAUSE_S, BUSY_PATIENCE_S = 0.1, 3.0
+LATEST = 2**31  # first date that libgphoto2 cannot express [s since 1970]
 T = TypeVar("T")
 
 
@@ -179,9 +180,12 @@ def _apply(link: GphotoLink, clock: Clock, camera: str, names: Collection[str], 
     if name not in names:
         known = closest(names, name)
         raise ConfigError(f"hardware.zoom.settings: the {camera} has no setting '{name}'; valid here: {known}")
-    _check(patiently(clock, lambda: link.get(name)), f"hardware.zoom.settings.{name}", value)
+    setting = patiently(clock, lambda: link.get(name))
+    _check(setting, f"hardware.zoom.settings.{name}", value)
     patiently(clock, lambda: link.put(name, value))
     got = patiently(clock, lambda: link.get(name)).value
+    if setting.kind == "date":  # the camera's clock advances
+        return
     if got != value and not (isinstance(got, float) and got == float(value)):
         log.warning("the %s took '%s' for its setting '%s' as '%s'", camera, value, name, got)
 
@@ -196,6 +200,8 @@ def _check(setting: Setting, where: str, value: str) -> None:
         number = _number(value)
         if number is None or not setting.low <= number <= setting.high:
             raise ConfigError(f"{where}: '{value}' is not within {setting.low:g} to {setting.high:g}")
+    if setting.kind == "date" and not (value.isascii() and value.isdigit() and int(value) < LATEST):
+        raise ConfigError(f"{where}: '{value}' is no time in whole seconds since 1970")
 
 
 def _zoom_setting(

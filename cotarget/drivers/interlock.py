@@ -52,7 +52,8 @@ class PositionLostMarker:
         beside = without if stop_file is None else stop_file.absolute()
         self._folder, self._begin = beside.parent, f"{beside.name}."
         self.file = self._folder / f"{self._begin}{names[0]}{SUFFIX}"
-        self._of_port = [without.with_name(f"{without.name}.{name}{SUFFIX}") for name in dict.fromkeys(names)]
+        # Units without an address would share a name.
+        self._of_port = [without.with_name(f"{without.name}.{name}{SUFFIX}") for name in dict.fromkeys(names) if name]
 
     def files(self) -> list[Path]:
         """List the markers for any unit of this rig, and for the unit at this port.

@@ -20,7 +20,7 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Annotated, Protocol, TypeVar
 
 from cotarget.config import SafetyConfig
-from cotarget.drivers.axes import AxisFacts, AxisTrack, Poll
+from cotarget.drivers.axes import AXES, AxisFacts, AxisTrack, Poll
 from cotarget.drivers.interlock import PositionLostMarker, addresses_of
 from cotarget.drivers.lens import LensPositions
 from cotarget.drivers.link_errors import CutError, LostError, PositionLostError, RefusedError, SilentError
@@ -78,13 +78,14 @@ class Requests:
         moves: moves that were not sent yet; the newest wins.
         zooms: positions of the lens that were not sent yet; the newest wins.
         closing: whether no more requests will come.
+        is_zooming: whether a zoom is sent, which a waiting move does not interrupt.
     """
 
     def __init__(self) -> None:
         self.halts: deque[Halt] = deque()
         self.moves: deque[Move] = deque()
         self.zooms: deque[float] = deque()
-        self.closing = False
+        self.closing = self.is_zooming = False
         self._woken: queue.SimpleQueue[None] = queue.SimpleQueue()  # whose `put` a signal handler may call
 
     def add(self, queued: deque[Request], request: Request) -> None:
@@ -100,7 +101,9 @@ class Requests:
     def pause(self, seconds: float) -> None:
         """Wait until a request comes, for at most a time [s]."""
         with contextlib.suppress(queue.Empty):
-            self._woken.get(timeout=seconds)
+            self._woken.get(timeout=seconds) if seconds else self._woken.get_nowait()
+            while True:  # one pause is for all that have come
+                self._woken.get_nowait()
 
     def halt_waits(self) -> bool:
         """Whether a halt, or the end of the driver, waits: a link gives up waiting for the unit."""
@@ -114,7 +117,7 @@ class Requests:
         """
         if self.halt_waits():
             raise DroppedError("the move was halted")
-        if self.moves:
+        if self.moves and not self.is_zooming:
             raise DroppedError("another move took this one's place")
 
 
@@ -312,21 +315,23 @@ class Loop:
         self._tracks = tuple(AxisTrack(facts) for facts in link.axes)
         self._head, self._lens = self._tracks[:2], self._tracks[2:]
         self._polled = True  # since the last command: commands in quick succession must not displace the polls
+        self._has_moved = False  # whether a move was sent since the last zoom
         self._cuts = 0  # in a row, without a poll between them
         self._active: Move | None = None
+        self._speeds: Pair = (0.0, 0.0)  # of the last move
         self.requests = Requests()
         self.halted = 0  # number of the newest halt that was taken out of the queue
         self.rests = False  # whether the unit acknowledged the last halt, after which nothing more is sent
         self.errors: deque[DeviceError] = deque(maxlen=1)  # of a move without a waiting caller; the next call raises it
         self.lens_errors: deque[DeviceError] = deque(maxlen=1)
         self._zooming: tuple[float, float] | None = None  # the lens's goal, and when it should have arrived [s]
-        self._heard_t = clock.now()
+        self._heard_t = [clock.now()] * len(self._tracks)  # when each axis last had a poll of a later time
         while not all(track.polls for track in self._tracks):
             self._poll_axes()
         self.snapshot, self.lens_snapshot = self._see(self._head), self._see(self._lens)
 
     def turn(self) -> None:
-        """Do the most urgent exchange: a halt, then a move, then a zoom, then a poll.
+        """Do the most urgent exchange: a halt, a move or a zoom, which take turns, or a poll.
 
         Raises:
             PositionLostError: the head's position may be lost.
@@ -336,10 +341,12 @@ class Loop:
         try:
             if requests.halts:
                 self._halt()
-            elif requests.moves and self._polled:
-                self._move()
-            elif requests.zooms and self._polled:
+            elif requests.zooms and self._polled and (self._has_moved or not requests.moves):
+                self._has_moved = False
                 self._zoom()
+            elif requests.moves and self._polled:
+                self._has_moved = True
+                self._move()
             else:
                 self._poll()
         except DroppedError as dropped:
@@ -352,7 +359,7 @@ class Loop:
             elif self._cuts >= TRIES:
                 raise
         self._link.check()
-        if self._polled and self._link.pause_s:
+        if self._polled:
             requests.pause(self._link.pause_s)
 
     def stop_for_good(self, reason: DeviceError) -> None:
@@ -405,25 +412,33 @@ class Loop:
         self._link.check()
         self.requests.proceed()
         self._link.move(move.goals, move.speeds, self.requests)
+        longest = 0.0
+        for axis, goal, speed, before in zip(self._head, move.goals, move.speeds, self._speeds, strict=True):
+            # A head on its way to an earlier goal must brake first, and perhaps come back.
+            fastest = speed if axis.stands() else max(speed, before)
+            overshoot = 0.0 if axis.stands() else before * axis.facts.braking_s(before)
+            way = abs(goal - axis.newest.position) + overshoot
+            longest = max(longest, way / speed + 2 * axis.facts.braking_s(fastest))
+        self._speeds = move.speeds
         self._expect_motion(self._head)
-        longest = max(
-            abs(goal - axis.newest.position) / speed + 2 * axis.facts.braking_s(speed)
-            for axis, goal, speed in zip(self._head, move.goals, move.speeds, strict=True)
-        )
         move.deadline = self._clock.now() + longest + self._delay + PATIENCE_S
 
     def _zoom(self) -> None:
         self.lens_snapshot = replace(self.lens_snapshot, moving=True)  # before the request leaves the queue, as a move
         *_, position = drained(self.requests.zooms)
-        self._polled = False
+        self._polled, self.requests.is_zooming = False, True
         try:
             self._link.zoom(position, self.requests)
-        except (DroppedError, CutError):
+        except DroppedError:
             self.requests.zooms.appendleft(position)  # a newer one replaces it
             raise
-        except RefusedError as error:
+        except (RefusedError, CutError) as error:
             self.lens_errors.append(error)
+            if isinstance(error, CutError):
+                raise
             return
+        finally:
+            self.requests.is_zooming = False
         self._expect_motion(self._lens)
         (lens,) = self._lens
         longest = abs(position - lens.newest.position) / lens.facts.fastest + 2 * lens.facts.braking_s(
@@ -441,6 +456,8 @@ class Loop:
         move = self._active
         if move is not None and move.deadline is not None:
             if self._stand(self._head) and not self._off_goal(move):
+                if type(self._link).renew is not HeadLink.renew:
+                    self._link.halt(LOOP_HALT_S + braking_s(self._link.axes))  # its last velocity would take it on
                 self._active = None
                 self.snapshot = self._see(self._head)
                 move.finish()
@@ -454,10 +471,14 @@ class Loop:
     def _poll_axes(self) -> None:
         now = self._clock.now()
         for poll in self._link.poll(self.requests):
-            self._tracks[poll.axis].add(poll)
-            self._heard_t = now
-        if now - self._heard_t > UNHEARD_S:
-            raise SilentError(f"the unit at {self._link.name} has reported no position for {UNHEARD_S:g} s")
+            track = self._tracks[poll.axis]
+            if not track.polls or poll.t > track.newest.t:
+                self._heard_t[poll.axis] = now
+            track.add(poll)
+        silent = [name for name, t in zip(AXES, self._heard_t, strict=False) if now - t > UNHEARD_S]
+        if silent:
+            what = f"has reported no position of {' and '.join(silent)} with a later time for {UNHEARD_S:g} s"
+            raise SilentError(f"the unit at {self._link.name} {what}")
         self._cuts = 0
 
     def _check_lens(self) -> None:
@@ -473,6 +494,8 @@ class Loop:
             self.lens_errors.append(DeviceError(f"the lens at {self._link.name} did not arrive in time: it is at {at}"))
 
     def _renew(self, move: Move) -> None:
+        if self.requests.halt_waits() or self.requests.moves:
+            return
         try:
             self._link.renew(self.requests)
         except RefusedError as error:
@@ -534,8 +557,6 @@ class Loop:
 
     def why_restless(self) -> str:
         """Explain why pan and tilt are not known to stand."""
-        if all(len({poll.t for poll in track.polls}) == 1 for track in self._head):
-            return "its positions have the same time over and over; correct the driver"
         if any(track.newest.moving for track in self._head):
             return "it says that it moves; if it stands all the same, let its driver give moving=None"
         return "if it trembles there, give its axes more slack in the driver"
@@ -547,13 +568,15 @@ class Loop:
     def _see(self, tracks: Sequence[AxisTrack]) -> Snapshot:
         """Make a snapshot of pan and tilt, or of the lens, at the older one of their newest polls."""
         t = min((track.newest.t for track in tracks), default=-math.inf)
-        moving = not self._stand(tracks) or (tracks is self._head and self._active is not None)
+        commanded = self._active is not None if tracks is self._head else self._zooming is not None
+        moving = commanded or not self._stand(tracks)
         sigma = max((track.newest.sigma * track.facts.unit for track in tracks), default=0.0)
         return Snapshot(tuple(track.interpolate(t) for track in tracks), moving, t, sigma)
 
 
 # The head
 
+OF_A_UNIT = ("poll", "move", "halt", "close")  # methods of a `HeadLink` that have no default
 STANDS_S = 5.0  # time limit for a head that turned when it was opened to stand after the halt [s]
 HALT_S = 1.0  # time limit for the answer to a halt, beyond braking; synchronising the line may come first [s]
 CLOSE_S = 5.0  # time limit for the thread to end [s]
@@ -776,7 +799,9 @@ class PolledHead:
 def _checked(link: HeadLink) -> HeadLink:
     """Refuse a link that lacks a part of `HeadLink`, and name the part."""
     needed = ("name", "axes", *(name for name in vars(HeadLink) if not name.startswith("_")))
-    if lacks := [name for name in needed if not hasattr(link, name)]:
+    own = [name for name in needed if getattr(type(link), name, None) is not getattr(HeadLink, name, ...)]
+    lacks = [name for name in needed if not hasattr(link, name) or (name in OF_A_UNIT and name not in own)]
+    if lacks:
         if "close" not in lacks:
             link.close()
         raise ConfigError(f"hardware.head.driver: {type(link).__name__} has no {lacks[0]}; HeadLink says what it needs")

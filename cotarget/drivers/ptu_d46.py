@@ -46,6 +46,7 @@ class D46Settings(PolledHeadSettings):
 
     Attributes:
         port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
+        step_deg: step size that the unit is expected to report, or those of pan and tilt [degrees].
         baud: baud rate of the serial line.
         pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as in the D46's manual.
     """

@@ -47,20 +47,20 @@ FIXED, ZOOM = "fixed", "zoom"  # the frames' folders
 COMPLETE = "complete"  # value of `end` for a run that nothing interrupted
 Number = float | bool | None
 Parsed = TypeVar("Parsed")
-# Calls on a rig: valid numbers of arguments, and number of values in the result. A frame's result is its time.
-CALLS: Mapping[str, tuple[tuple[int, ...], int]] = {
-    "fixed.read": ((2,), 1),  # newer_than, timeout -> t
-    "zoom.read": ((2,), 1),
-    "zoom.capture": ((0,), 1),
-    "zoom.zoom": ((1,), 1),  # focal_px -> focal_px
-    "zoom.state": ((0,), 3),  # -> focal_px, moving, t
-    "head.move": ((4, 5), 2),  # pan, tilt, speed (of both axes or of each), wait -> pan, tilt
-    "head.state": ((0,), 4),  # -> pan, tilt, moving, t
-    "head.halt": ((0,), 0),
-    "clock.now": ((0,), 1),
-    "clock.sleep_until": ((1,), 0),
-    "board.present": ((0, 6), 0),  # translation and rotation vector [rad], or no board
-    "board.swing": ((6,), 0),
+# Calls on a rig: valid numbers of arguments, and of values in the result. A frame's result is its time.
+CALLS: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
+    "fixed.read": ((2,), (1,)),  # newer_than, timeout -> t
+    "zoom.read": ((2,), (1,)),
+    "zoom.capture": ((0,), (1,)),
+    "zoom.zoom": ((1,), (1,)),  # focal_px -> focal_px
+    "zoom.state": ((0,), (3,)),  # -> focal_px, moving, t
+    "head.move": ((4, 5), (2,)),  # pan, tilt, speed (of both axes or of each), wait -> pan, tilt
+    "head.state": ((0,), (4, 5)),  # -> pan, tilt, moving, t, and sigma where it is not 0
+    "head.halt": ((0,), (0,)),
+    "clock.now": ((0,), (1,)),
+    "clock.sleep_until": ((1,), (0,)),
+    "board.present": ((0, 6), (0,)),  # translation and rotation vector [rad], or no board
+    "board.swing": ((6,), (0,)),
 }
 FRAMES = frozenset({"fixed.read", "zoom.read", "zoom.capture"})
 
@@ -164,7 +164,7 @@ def parse_event(row: Mapping[str, Any]) -> Event:
         error = str(name), str(message)
     args, result = (tuple(map(_number, row.get(key, ()))) for key in ("args", "result"))
     arities, numbers = CALLS[call]
-    if len(args) not in arities or len(result) != (0 if error else numbers) or None in result:
+    if len(args) not in arities or len(result) not in ((0,) if error else numbers) or None in result:
         raise ValueError(f"{call} has other numbers")
     image, size = row.get("image"), row.get("bytes", 0)
     if image is not None and not (isinstance(image, str) and _is_inside(image) and call in FRAMES):
@@ -234,9 +234,13 @@ def parse_spec(table: Mapping[str, Any], described: Callable[[], RigSpec]) -> Ri
     fixed_size, zoom_size, still_size = size("fixed_size"), size("zoom_size"), size("still_size")
     focal_range = pair("focal_range_px")
 
+    def of_axes(key: str) -> Any:
+        value = table.get(key, 0.0) if key == "slack" else table[key]  # an earlier version has no slack
+        pan, tilt = value if isinstance(value, list) else (value, value)
+        return pan, tilt
+
     def axis(name: str, number: int) -> AxisLimits:
-        own = [table["speed"], table["acceleration"], table["step"], table.get("slack", 0.0)]
-        speed, acceleration, step, slack = (each[number] if isinstance(each, list) else each for each in own)
+        speed, acceleration, step, slack = (of_axes(key)[number] for key in ("speed", "acceleration", "step", "slack"))
         known = None if acceleration is None else float(acceleration)
         return AxisLimits(pair(name), float(speed), known, float(step), float(slack))
 

@@ -59,8 +59,9 @@ class SafeHead:
         """
         self._watchdog.on_call()
         state = self._head.state()
-        if not (math.isfinite(state.pan) and math.isfinite(state.tilt)):
-            raise DeviceError(f"the head reports that it is at pan {state.pan}, tilt {state.tilt}")
+        if not (math.isfinite(state.pan) and math.isfinite(state.tilt) and 0 <= state.sigma < math.inf):
+            sigma = f", with a standard deviation of {state.sigma}" if state.sigma else ""
+            raise DeviceError(f"the head reports that it is at pan {state.pan}, tilt {state.tilt}{sigma}")
         self._watchdog.saw(state, self._limits)
         return state
 
@@ -104,10 +105,10 @@ class SafeHead:
             return 0.0  # only a simulated head has infinite speed, and its wait is not watched
         state, longest = self._head.state(), 0.0
         ways = (goal[0] - state.pan, goal[1] - state.tilt)
-        for way, speed, limits in zip(ways, speeds, self._limits.axes, strict=True):
-            axis = replace(limits, speed=speed)
+        for way, speed, axis in zip(ways, speeds, self._limits.axes, strict=True):
             # A head that turns the other way must brake first, and then come back.
-            longest = max(longest, axis.travel_s(way) + 2 * axis.braking_s)
+            overshoot = axis.speed * axis.braking_s if state.moving else 0.0
+            longest = max(longest, replace(axis, speed=speed).travel_s(abs(way) + overshoot) + 2 * axis.braking_s)
         return ARRIVAL_S + SLOWNESS * longest
 
 
@@ -304,7 +305,7 @@ def guard(rig: Rig, config: SafetyConfig) -> Rig:
     behind = _Guard(rig, config)
     try:
         refuse_if_stopped(config.stop_file)
-        limits = soft_limits(rig.head.limits, config)
+        limits = rig.head.limits if "head" in rig.missing else soft_limits(rig.head.limits, config)
         watchdog, max_age_s = behind.watchdog, config.max_frame_age_s
         guarded = replace(
             rig,

@@ -315,7 +315,7 @@ class Watchdog:
 
 
 POLL_S = 0.05  # period of reading the stop file, and of repeating a failed halt [s]
-JOIN_S = 2.0  # time limit for the thread to end: longer than a halt takes [s]
+JOIN_S = 3.5  # time limit for the thread to end [s]: longer than a halt takes, 3 s with a usual time to brake
 
 
 class Watcher:

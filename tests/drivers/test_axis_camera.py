@@ -21,7 +21,7 @@ from cotarget.drivers import axis, frame_buffer
 from cotarget.drivers.axis import AxisCamera, AxisSettings, LoginError
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
-from tests.support.plants import FEED_SIZE, PASSWORD, USER, axis_server
+from tests.support.plants import FEED_SIZE, PASSWORD, USER, axis_server, wait_for
 
 pytestmark = pytest.mark.wire
 PARAM, STATUS, VIDEO = "/axis-cgi/param.cgi", "/axis-cgi/videostatus.cgi", "/axis-cgi/mjpg/video.cgi"
@@ -202,6 +202,7 @@ def test_frames_carry_the_time_of_their_first_byte(server):
         second = camera.read(first.t, PATIENCE_S)
         assert before <= second.t + LATENCY_S <= between
         np.testing.assert_array_equal(second.image, decoded(1))
+        assert (camera.counts.frames, camera.counts.refused, camera.counts.reconnects) == (2, 0, 0)
 
 
 def test_the_stream_is_asked_for_as_configured(server):
@@ -253,7 +254,7 @@ def test_authentication_is_what_the_server_asks_for(scheme, place, monkeypatch, 
         with opened(unit, size=FEED_SIZE, resolution="320x240", **given) as camera:
             t = camera.read().t
             unit.faults.set("cut")
-            until(camera, t, "reconnecting")
+            wait_for(lambda: camera.counts.reconnects)
             unit.faults.set("cut", False)
             assert camera.read(t, PATIENCE_S).t > t
     assert "hunter2" not in caplog.text
@@ -369,8 +370,9 @@ def test_a_cut_stream_is_opened_again(server):
         viewer.cut()
         begun = time.monotonic()
         server.viewer().send(part(jpeg(2)))
-        camera.read(t, PATIENCE_S)
+        t = camera.read(t, PATIENCE_S).t
         assert time.monotonic() - begun < PATIENCE_S / 2
+        assert (camera.counts.frames, camera.counts.refused, camera.counts.reconnects) == (2, 1, 1)
 
 
 def test_a_refused_login_is_not_repeated_at_once(server, monkeypatch):
@@ -412,7 +414,8 @@ def test_damaged_pictures_are_dropped_and_counted(server, whole, capfd):
         viewer = server.viewer()
         t = camera.read().t
         viewer.send(part(damaged) + b"--myboundary\r\n")
-        until(camera, t, "are broken, 1 so far")
+        until(camera, t, "broken")
+        assert camera.counts.refused == 1
         viewer.send(part(jpeg(2)))
         assert camera.read(t, PATIENCE_S).t > t
     assert capfd.readouterr() == ("", "")
@@ -484,7 +487,7 @@ FAULTS = {
     "unauthorized": r"\(401\)",
     "busy": r"\(503\)",
     "frozen": "repeats the same picture",
-    "no-video": "repeats the same picture",
+    "no-video": "its input 1 has no video",
     "refuse": "cannot be reached|broke off|HTTP",
     "corrupt": "are broken",
     "resolution": "160x120",
@@ -493,6 +496,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_each_fault_is_named_and_recovered_from(emulated, fault, monkeypatch, capfd):
+    monkeypatch.setattr(axis, "FROZEN_S", 0.3)
     monkeypatch.setattr(frame_buffer, "REFUSED_PAUSE_S", 0.3)
     words = FAULTS[fault]
     emulated.faults.set(fault, words is None)

@@ -1,6 +1,7 @@
 """The newest frame, handed from a camera's thread to its callers; mostly in simulated time."""
 
 import math
+import threading
 
 import cv2
 import numpy as np
@@ -56,6 +57,7 @@ def test_the_newest_frame_is_read_with_the_time_of_its_exposure(bench, encode):
     assert frame.t == pytest.approx(bench.clock.t - LATENCY_S)
     assert bench.read().t == frame.t
     assert "no newer picture" in bench.why(frame.t)
+    assert (bench.frames.counts.frames, bench.frames.counts.skipped) == (3, 2)
 
 
 @pytest.mark.parametrize(
@@ -67,11 +69,12 @@ def test_a_repeated_frame_is_no_new_one(bench, encode, own, again):
     t = bench.read().t
     for _ in range(20):
         assert not bench.put(encode(10), **again)
-    assert bench.frames.waited_s == pytest.approx(20 * 0.04)
+    assert bench.frames.counts.repeated == 20
+    assert bench.frames.frozen_s == pytest.approx(20 * 0.04)
     assert "repeats the same picture" in bench.why(t)
     bench.put(encode(11))
     assert bench.read(t).t > t
-    assert bench.frames.waited_s == 0.0
+    assert bench.frames.frozen_s == 0.0
 
 
 @pytest.mark.parametrize(
@@ -91,6 +94,7 @@ def test_a_picture_that_a_live_stream_repeats_is_a_new_frame(bench, encode, own)
         expected = own(i).get("t", bench.clock.t - LATENCY_S)
         t = bench.read(t).t
         assert t == expected
+    assert bench.frames.counts.repeated == bench.frames.frozen_s == 0
 
 
 def test_an_old_frame_is_none():
@@ -102,32 +106,36 @@ def test_an_old_frame_is_none():
     assert "nothing for 0.3 s" in bench.why(None)
 
 
-# What happens after a frame, and the reason why no newer one can be read.
+# What happens after a frame, the reason why no newer one can be read, and how many frames are refused for that.
 REASONS = {
-    "damaged": (lambda bench: bench.put(jpeg(20)[:-20]), "broken, 1 so far"),
-    "cut short": (lambda bench: bench.frames.refuse(2), "broken, 2 so far"),
-    "late": (lambda bench: bench.put(image(20), took=2 * FRESH_S), "take 1 s to come, 1 so far"),
+    "damaged": (lambda bench: bench.put(jpeg(20)[:-20]), "broken", 1),
+    "cut short": (lambda bench: bench.frames.refuse(2), "broken", 2),
+    "late": (lambda bench: bench.put(image(20), took=2 * FRESH_S), "take 1 s to come", 1),
     "late, and again in time": (
         lambda bench: (bench.put(jpeg(20), took=2 * FRESH_S), bench.put(jpeg(20))),
-        "take 1 s to come, 1 so far",
+        "take 1 s to come",
+        1,
     ),
-    "remarked": (lambda bench: bench.frames.remark("its input has no video"), "its input has no video"),
-    "lost": (lambda bench: bench.frames.lose(DeviceError("its cable is unplugged")), "unplugged; reconnecting"),
-    "nothing": (lambda bench: None, "no newer picture"),
+    "remarked": (lambda bench: bench.frames.remark("its input has no video"), "its input has no video", 0),
+    "lost": (lambda bench: bench.frames.lose(DeviceError("its cable is unplugged")), "unplugged; reconnecting", 0),
+    "nothing": (lambda bench: None, "no newer picture", 0),
 }
 
 
 @pytest.mark.parametrize("name", REASONS)
 def test_reading_says_why_no_newer_frame_comes_until_the_next_one(bench, name):
-    act, reason = REASONS[name]
+    act, reason, refused = REASONS[name]
     bench.frames.opened()
     bench.put(image(10))
     t = bench.read().t
     act(bench)
     assert reason in bench.why(t)
+    assert bench.frames.counts.refused == refused
     bench.put(jpeg(30))
     np.testing.assert_array_equal(bench.read(t).image, image(30))
     assert "no newer picture" in bench.why()
+    bench.frames.opened()
+    assert bench.frames.counts.reconnects == 1
 
 
 def test_an_error_names_silence_and_remark(bench):
@@ -163,7 +171,7 @@ def test_the_first_frame_is_waited_for(bench):
 # On a thread.
 def test_a_stream_is_opened_again_until_the_buffer_is_closed(monkeypatch):
     monkeypatch.setattr(frame_buffer, "LONGEST_PAUSE_S", 0.01)
-    frames, tries = FrameBuffer("the camera", MonotonicClock(), SIZE, 0.0, PATIENCE_S), []
+    frames, tries, after = FrameBuffer("the camera", MonotonicClock(), SIZE, 0.0, PATIENCE_S), [], threading.Event()
 
     def stream():
         tries.append(0)
@@ -174,14 +182,15 @@ def test_a_stream_is_opened_again_until_the_buffer_is_closed(monkeypatch):
         if len(tries) > 5:
             raise DeviceError("it is unplugged")
 
-    frames.start(lambda: frames.keep_open(stream), "camera")
+    frames.start(lambda: frames.keep_open(stream, after.set), "camera")
     assert frames.first(PATIENCE_S) == SIZE
     t = frames.read(timeout=PATIENCE_S).t
     for _ in range(4):
         t = frames.read(t, PATIENCE_S).t
+    assert after.wait(PATIENCE_S)
     frames.close()
     assert frames.join()
-    assert len(tries) >= 2 + 5  # five frames were read, each of a stream of its own
+    assert frames.counts.reconnects >= 4
     with pytest.raises(DeviceError, match="the camera is closed"):
         frames.read()
 

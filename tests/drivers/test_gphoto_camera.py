@@ -95,10 +95,10 @@ def test_a_camera_that_always_shoots_and_has_no_targets_is_taken_as_it_is():
 
 
 def test_settings_are_applied_and_a_target_of_the_users_own_is_left(caplog):
-    settings = {"iso": "80", "owner": "us", "capturetarget": "Memory card"}
+    settings = {"iso": "80", "owner": "us", "capturetarget": "Memory card", "datetime": "1190000000"}
     camera = Bench(replace(CONFIG, settings=settings)).camera
     assert camera.commands("capturetarget") == ["Memory card"]
-    assert {name: camera.values[name] for name in settings} == settings
+    assert {name: camera.values[name] for name in settings} == settings | {"datetime": 1.19e9}
     assert caplog.messages == []
 
 
@@ -120,6 +120,8 @@ REFUSED = [
     ({"zoom": "135"}, {}, "hardware.zoom.settings.zoom"),
     ({"zoom": "wide"}, {}, "hardware.zoom.settings.zoom"),
     ({"capture": "yes"}, {}, "hardware.zoom.settings.capture"),
+    ({"datetime": "1.5"}, {}, "hardware.zoom.settings.datetime"),
+    ({"datetime": "99999999999"}, {}, "hardware.zoom.settings.datetime"),
     ({}, {"range": (0.0, 100.0, 1.0)}, "hardware.zoom.lens"),
     ({}, {"range": (3.0, 134.0, 1.0)}, "hardware.zoom.lens"),
     ({}, {"range": (0.0, 1000.0, 500.0)}, "hardware.zoom.lens"),
@@ -263,6 +265,7 @@ def test_a_viewfinder_fault_is_named_and_recovered_from(name):
     assert reason in str(error.value)
     bench.run(0.5)
     assert bench.frames[-1] is newest
+    assert bench.buffer.counts.refused > 0 or reason not in ("broken", "take 1 s to come")
     bench.camera.frozen = None
     bench.camera.take.clear()
     bench.camera.fail.clear()

@@ -1,5 +1,6 @@
 """`PolledHead` on a unit whose axes report both at once and take a move in one message, in simulated time."""
 
+import itertools
 import math
 import signal
 import threading
@@ -376,9 +377,9 @@ class Turret(HeadLink):
 
 
 class VelocityTurret(Turret):
-    """A turret that takes velocities, each for `LASTS_S`."""
+    """A turret that takes velocities, each until the next; the last ones are slow."""
 
-    LASTS_S, GAIN = 0.05, 10.0
+    LASTS_S, GAIN = math.inf, 1.0
     rates, until = (0.0, 0.0), 0.0
 
     def turn(self):
@@ -432,7 +433,10 @@ def test_a_continuous_head_arrives_within_its_slack(turret, kind):
 def test_velocities_are_renewed_until_the_head_arrives_or_is_halted(turret):
     head, link = turret(VelocityTurret)
     head.move(math.radians(60.0), 0.0, wait=True)
-    assert len(link.sent) > 60.0 / RATES[0] / VelocityTurret.LASTS_S  # each would have ended after that time
+    assert len(link.sent) > 10
+    at, begin = link.at[0], link.clock.now()
+    wait_for(lambda: link.clock.now() > begin + 1.0)
+    assert link.at[0] == at == pytest.approx(60.0, abs=DEGREES.slack)  # it does not creep on
     link.sent.clear()
     head.move(math.radians(-60.0), 0.0)
     wait_for(lambda: link.at[0] < 50.0)
@@ -453,7 +457,9 @@ def test_a_head_that_does_not_come_to_rest_at_its_goal_is_an_error(turret):
 @pytest.mark.parametrize(("poll", "said"), [
     (lambda t: [], "has reported no position"),
     (lambda t: [Poll(axis, math.nan, t) for axis in range(3)], "pan is reported to be at nan"),
-    (lambda t: [Poll(axis, 1.0, 0.0) for axis in range(3)], "the same time over and over"),
+    (lambda t: [Poll(axis, 1.0, t, sigma=math.nan) for axis in range(3)], "standard deviation of nan"),
+    (lambda t: [Poll(axis, 1.0, 0.0) for axis in range(3)], "of pan and tilt and the lens with a later time"),
+    (lambda t: [Poll(axis, 1.0, t) for axis in range(2)], "of the lens with a later time"),
     (lambda t: [Poll(axis, 1.0, t, moving=True) for axis in range(3)], "moving=None"),
 ])  # fmt: skip
 def test_a_unit_that_reports_nothing_usable_is_refused(tmp_path, monkeypatch, poll, said):
@@ -510,6 +516,36 @@ def test_the_lens_may_be_a_third_axis(turret):
     assert not lens.state().moving
     for wrong in (0.0, math.nan, math.inf):
         assert "cannot go" in fails(lambda wrong=wrong: lens.zoom(wrong))
+
+
+def test_moves_and_zooms_take_turns():
+    """Each move comes before the poll of the one before is over, as over a slow line."""
+    link, sent = Turret(SimClock()), []
+    loop, numbers = Loop(link, link.clock, 0.0), itertools.count(1)
+    link.move, link.zoom = lambda *_: sent.append("move"), lambda *_: sent.append("zoom")
+    for _ in range(8):
+        loop.requests.add(loop.requests.moves, Move(next(numbers), (30.0, 0.0), (60.0, 60.0)))
+        loop.requests.add(loop.requests.zooms, 500.0)
+        loop.turn()
+    assert sent == ["move", "zoom", "move", "zoom"]
+
+
+def test_a_lens_that_has_not_started_yet_moves(turret):
+    head, link = turret(zoom=lambda position, requests: None)
+    lens = head.lens(LensPositions(((0, 100.0), (1000, 1000.0)), range(1001)))
+    lens.zoom(500.0)
+    begin = link.clock.now()
+    wait_for(lambda: link.clock.now() > begin + LENS.still_s + 0.5)
+    assert lens.state().moving
+
+
+@pytest.mark.parametrize("lacks", ["poll", "move", "halt", "close"])
+def test_a_link_without_one_of_its_own_methods_is_refused(tmp_path, monkeypatch, lacks):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    own = {name: vars(Turret)[name] for name in vars(Turret) if name != lacks}
+    link = type("Lacking", (HeadLink,), {**own, "__abstractmethods__": frozenset()})(SimClock())
+    with pytest.raises(ConfigError, match=f"Lacking has no {lacks}"):
+        PolledHead(lambda: link, Settings(**{**SETTINGS, "step_deg": 0.0}), link.clock)
 
 
 def test_a_pause_between_polls_holds_up_no_request(turret):

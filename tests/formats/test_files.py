@@ -27,7 +27,7 @@ from cotarget.geometry import pose
 from cotarget.metrics import read_rows, score, write_rows
 from cotarget.recording.recorder import Recorder
 from cotarget.recording.replay import Replay
-from cotarget.rig import Frame, PanTiltState, ZoomState
+from cotarget.rig import AxisLimits, Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.safety.stop_file import refuse_if_stopped
 from cotarget.track_metrics import read_labels, read_tracks
 from tests.formats.lists import (
@@ -435,6 +435,26 @@ def test_every_call_is_recorded_as_before(tmp_path):
     assert record_every_call(tmp_path / "now") == ANSWERS
     assert plain_log(tmp_path / "now") == plain_log(OLD / "every_call")
     assert_is_recording(tmp_path / "now", may_lack=["template.png"])
+
+
+def test_states_of_uncertain_angles_and_limits_that_differ_are_replayed(tmp_path):
+    """As of a dome whose axes differ, and which does not say how it accelerates."""
+    limits = PanTiltLimits(AxisLimits((-2.5, 2.5), 1.0, None, 0.01, 0.02), AxisLimits((-0.75, 0.5), 0.5, 2.0, 0.005))
+    said = [PanTiltState(0.125, -0.25, False, 100.0 + i, sigma) for i, sigma in enumerate((0.0, 0.01))]
+    fake, states = fake_rig([]), iter(said)
+    fake.head.limits, fake.head.state = limits, lambda: next(states)
+    with (
+        Recorder(tmp_path / "dome", parse_config({}), OLD / "calibration_plain.json", "bird") as recorder,
+        recorder.wrap(rig_of(fake)) as rig,
+    ):
+        rig.fixed.read()
+        assert [rig.head.state() for _ in said] == said
+        rig.fixed.read(100.125)
+    recording = open_recording(tmp_path / "dome")
+    assert recording.spec.head.limits == limits
+    rig = Replay(recording).rig
+    rig.fixed.read()
+    assert [rig.head.state() for _ in said] == said
 
 
 def test_v010_recording_of_every_call_has_all_listed_keys():

@@ -33,6 +33,7 @@ class FakeLink:
         self.connected, self.ignore, self.frozen, self.threads = False, 0, None, set()
         self.choices = {"iso": ("Auto", "80", "100"), "capturetarget": ("Internal RAM", "Memory card")}
         self.values = {"capture": 0.0, "zoom": 0.0, "iso": "Auto", "capturetarget": "Memory card", "owner": "nobody"}
+        self.values["datetime"] = 1e9
         self.readonly, self.hidden = set(), {"zoom", "iso"}
         self.range = (0.0, 134.0, 1.0)
         self.preview_size, self.still_size, self.still = SIZE, STILL_SIZE, None
@@ -70,6 +71,8 @@ class FakeLink:
             return Setting("choice", value, choices=self.choices[name], readonly=readonly)
         if name == "zoom":
             return Setting("range", value, *self.range, readonly=readonly)
+        if name == "datetime":  # the camera's clock goes on
+            return Setting("date", value + 1.0, readonly=readonly)
         if name == "capture":
             return Setting("switch", value, choices=("0", "1"), readonly=readonly)
         return Setting("text", value, readonly=readonly)
@@ -79,7 +82,7 @@ class FakeLink:
         if name == "zoom" and self.ignore:
             self.ignore -= 1
             return
-        self.values[name] = value
+        self.values[name] = float(value) if name == "datetime" else value
 
     def preview(self):
         self._do("preview")
