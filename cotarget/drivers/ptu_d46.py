@@ -14,17 +14,10 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers import ptu_protocol
 from cotarget.drivers.axes import AxisFacts, Poll
 from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.head_link import HeadLink, Pair, Requests
 from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.link_errors import CutError, PositionLostError, RefusedError, ReplyError, SilentError
-from cotarget.drivers.polled_head import (
-    NOTHING_SAID,
-    HeadLink,
-    Pair,
-    PolledHead,
-    PolledHeadSettings,
-    Requests,
-    braking_s,
-)
+from cotarget.drivers.polled_head import NOTHING_SAID, PolledHead, PolledHeadSettings, braking_s
 from cotarget.drivers.ptu_protocol import AXES, DELIMITER, HALT, PATIENCE_S, AxisName, Line, command, open_line
 from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.rig import Clock

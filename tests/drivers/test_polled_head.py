@@ -10,10 +10,11 @@ import pytest
 
 from cotarget.config import SafetyConfig
 from cotarget.drivers.axes import AxisFacts, Poll
+from cotarget.drivers.head_link import HeadLink, Move, Requests
 from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.lens import LensPositions
 from cotarget.drivers.link_errors import CutError, LostError, PositionLostError, RefusedError, SilentError
-from cotarget.drivers.polled_head import HeadLink, Loop, Move, PolledHead, PolledHeadSettings, Requests
+from cotarget.drivers.polled_head import Loop, PolledHead, PolledHeadSettings
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from cotarget.schema import model
 from tests.support.emulated_camera import DEADLINE_S

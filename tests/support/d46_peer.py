@@ -8,7 +8,8 @@ import itertools
 import re
 from collections import deque
 
-from cotarget.drivers.polled_head import Halt, Loop, Move
+from cotarget.drivers.head_link import Halt, Move
+from cotarget.drivers.polled_head import Loop
 from cotarget.drivers.ptu_d46 import D46Link, D46Settings
 from cotarget.drivers.ptu_protocol import Line
 from tests.support.simulated_clock import SimClock
