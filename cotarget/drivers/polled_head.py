@@ -82,7 +82,8 @@ class PolledHeadSettings:
 
 TRIES = 3  # of a move, and of polls in a row, that end because the unit was silent
 PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
-UNHEARD_S = 5.0  # a unit that reports no position for this time is dead [s]
+# A unit that reports no position for this time [s] and in so many polls is dead; a program may have been suspended.
+UNHEARD_S, UNHEARD_POLLS = 5.0, 10
 LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: a unit may answer only when it stands [s]
 
 
@@ -150,6 +151,7 @@ class Loop:
         self.lens_errors: deque[DeviceError] = deque(maxlen=1)
         self._zooming: tuple[float, float] | None = None  # the lens's goal, and when it should have arrived [s]
         self._heard_t = [clock.now()] * len(self._tracks)  # when each axis last had a poll of a later time
+        self._unheard = [0] * len(self._tracks)  # polls since then
         while not all(track.polls for track in self._tracks):
             self._poll_axes()
         self.snapshot, self.lens_snapshot = self._see(self._head), self._see(self._lens)
@@ -297,9 +299,14 @@ class Loop:
         for poll in self._link.poll(self.requests):
             track = self._tracks[poll.axis]
             if not track.polls or poll.t > track.newest.t:
-                self._heard_t[poll.axis] = now
+                self._heard_t[poll.axis], self._unheard[poll.axis] = now, -1
             track.add(poll)
-        silent = [name for name, t in zip(AXES, self._heard_t, strict=False) if now - t > UNHEARD_S]
+        self._unheard = [count + 1 for count in self._unheard]
+        silent = [
+            name
+            for name, t, count in zip(AXES, self._heard_t, self._unheard, strict=False)
+            if now - t > UNHEARD_S and count > UNHEARD_POLLS
+        ]
         if silent:
             what = f"has reported no position of {' and '.join(silent)} with a later time for {UNHEARD_S:g} s"
             raise SilentError(f"the unit at {self._link.name} {what}")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import itertools
 import json
 import math
 import threading
@@ -100,8 +101,8 @@ def test_a_recording_holds_the_calls_and_frames_of_the_rig(tmp_path, calibration
 
 def test_events_are_written_and_parsed_to_the_last_bit():
     rng = np.random.default_rng(1)
-    for call, (arities, count) in CALLS.items():
-        for arity in arities:
+    for call, (arities, counts) in CALLS.items():
+        for arity, count in itertools.product(arities, counts):
             args = tuple(rng.normal(size=arity) * 10.0 ** rng.integers(-300, 300, arity))
             result = tuple(rng.normal(size=count) * 1e-7)
             event = Event(call, float(rng.normal()), tuple(map(float, args)), tuple(map(float, result)))
