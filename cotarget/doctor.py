@@ -1,6 +1,7 @@
 """Examine this machine: versions, rendering, film codec and devices, with the command that fixes what is missing."""
 
 import importlib.metadata
+import math
 import os
 import platform
 import re
@@ -26,10 +27,13 @@ if TYPE_CHECKING:
 
 # Rendering is tried in its own process, because a broken OpenGL may crash it.
 RENDER = (
-    "from cotarget.sim.render.opengl import BACKEND, make_renderer, mujoco;"
+    "from cotarget.sim.render.opengl import BACKEND, make_renderer, mujoco; from OpenGL import GL;"
     "m = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=\"1\"/></worldbody></mujoco>');"
-    "r = make_renderer(m, 64, 48); r.update_scene(mujoco.MjData(m)); r.render(); r.close(); print(BACKEND)"
+    "r = make_renderer(m, 64, 48); r.update_scene(mujoco.MjData(m)); r.render();"
+    "print(BACKEND + ': ' + GL.glGetString(GL.GL_RENDERER).decode()); r.close()"
 )
+SOFTWARE = ("llvmpipe", "softpipe", "swrast")  # Mesa's renderers without a GPU
+SOFTWARE_MP = 1.0  # size of a simulated image above which a frame takes them a fraction of a second [million pixels]
 RENDER_TIMEOUT_S = 60.0
 
 
@@ -49,7 +53,7 @@ def examine(config: "RigConfig | None" = None, rig: Path = Path("rig.toml")) -> 
         Finding("python", True, f"{platform.python_version()} on {platform.platform()}"),
         *map(_package, needed_packages()),
         _assets(),
-        rendering(),
+        rendering(config),
         _codec(),
         _serial_ports(),
         _gphoto_cameras(needed=_is_real(config)),
@@ -84,8 +88,8 @@ def _assets() -> Finding:
     return Finding("sim_assets", bool(scenes), f"scenes {', '.join(scenes)}" if scenes else "not found", fix)
 
 
-def rendering() -> Finding:
-    """Render a picture without a screen, in a separate process."""
+def rendering(config: "RigConfig | None" = None) -> Finding:
+    """Render a picture without a screen, in a separate process; say if the configured images are large for it."""
     try:
         tried = subprocess.run(
             [sys.executable, "-c", RENDER], capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False
@@ -93,11 +97,19 @@ def rendering() -> Finding:
     except subprocess.TimeoutExpired:
         return Finding("rendering", False, f"no picture within {RENDER_TIMEOUT_S:.0f} s", "export MUJOCO_GL=osmesa")
     if tried.returncode == 0:
-        return Finding("rendering", True, f"without a screen by {tried.stdout.split()[-1]}")
+        renderer = tried.stdout.strip().splitlines()[-1]
+        return Finding("rendering", True, f"without a screen by {renderer}{_slow_images(renderer, config)}")
     said = (tried.stderr.strip().splitlines() or [f"the test ended with status {tried.returncode}"])[-1]
     chosen = os.environ.get("MUJOCO_GL", "egl")
     fix = "apt-get install -y libegl1 libgl1-mesa-dri libgl1" if chosen == "egl" else "unset MUJOCO_GL"
     return Finding("rendering", False, said.split(": ", 1)[-1], fix)
+
+
+def _slow_images(renderer: str, config: "RigConfig | None") -> str:
+    if config is None or config.backend != "sim" or not any(name in renderer for name in SOFTWARE):
+        return ""
+    largest = max(math.prod(camera.size) for camera in (config.sim.fixed, config.sim.zoom)) / 1e6
+    return f"; this is software, which is slow for images of {largest:.1f} MP" if largest > SOFTWARE_MP else ""
 
 
 def _codec() -> Finding:

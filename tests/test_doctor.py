@@ -22,7 +22,7 @@ from cotarget.errors import install_extra, pip_install
 @pytest.fixture
 def tried(monkeypatch):
     """The outcome of the replaced rendering process."""
-    outcome = SimpleNamespace(returncode=0, stdout="egl\n", stderr="", error=None)
+    outcome = SimpleNamespace(returncode=0, stdout="egl: llvmpipe (LLVM 15)\n", stderr="", error=None)
     real = subprocess.run
 
     def run(command, **options):
@@ -48,7 +48,7 @@ def test_complete_machine_passes(tried, capsys):
     assert {"python", "rendering", "H.264", "sim_assets", "serial ports", "gphoto2 cameras", *needed_packages()} == set(
         names
     )
-    assert finding("rendering").text == "without a screen by egl"
+    assert finding("rendering").text == "without a screen by egl: llvmpipe (LLVM 15)"
     assert finding("sim_assets").text == "scenes indoor, outdoor"
     assert cli.main(["doctor"]) == 0
     out = capsys.readouterr().out.splitlines()
@@ -139,6 +139,18 @@ def test_failed_rendering_is_reported_with_its_fix(tried, monkeypatch, change, b
     assert not found.ok
     assert found.text == text
     assert fix in found.fix
+
+
+@pytest.mark.parametrize(("size", "renderer", "said"), [
+    ([1920, 1080], "egl: llvmpipe (LLVM 15)", "; this is software, which is slow for images of 2.1 MP"),
+    ([640, 480], "egl: llvmpipe (LLVM 15)", ""),
+    ([1920, 1080], "egl: NVIDIA GeForce", ""),
+])  # fmt: skip
+def test_large_images_rendered_in_software_are_named(tried, size, renderer, said):
+    tried.stdout = f"{renderer}\n"
+    found = doctor.rendering(parse_config({"sim": {"fixed": {"size": size}}}))
+    assert found.ok
+    assert found.text == f"without a screen by {renderer}{said}"
 
 
 @pytest.mark.render
