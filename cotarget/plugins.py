@@ -103,7 +103,7 @@ def calling(what: str) -> Iterator[None]:
 
 
 def place_of(error: Exception) -> str:
-    """Return file and line where an error was raised; of a user's code those in it, though a library raised it."""
+    """Return file and line where an error was raised; if a library raised it, those of the user's call into it."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}"
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_ours(frame.filename)]

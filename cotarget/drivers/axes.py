@@ -51,9 +51,9 @@ class AxisFacts:
         """Positions that differ by no more are the same: half a step."""
         return self.step / 2 or ROUNDING * (self.highest - self.lowest)
 
-    def is_near(self, position: float, other: float) -> bool:
-        """Whether an axis at a position may stand at another, but for its slack."""
-        return abs(position - other) <= self.slack + self.same
+    def is_near(self, position: float, goal: float) -> bool:
+        """Whether an axis at a position has arrived at a goal, within its slack."""
+        return abs(position - goal) <= self.slack + self.same
 
     def braking_s(self, speed: float) -> float:
         """Time [s] to come to rest from a speed [1/s]."""
@@ -136,7 +136,7 @@ class AxisTrack:
         self.polls.append(poll)
 
     def _stays(self, position: float) -> bool:
-        """Whether a position is within the slack to either side of a place that the last ones are in too."""
+        """Whether the axis is still at rest: a trembling one reports positions up to twice its slack apart."""
         return abs(position - self._rest) <= 2 * self.facts.slack + self.facts.same
 
     def expect_motion(self, t: float) -> None:
