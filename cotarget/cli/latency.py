@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 
 from cotarget.cli.common import add_file, add_insist, add_rig, check_board_size, load_plausible, open_named, print_json
-from cotarget.errors import CalibrationError, ConfigError
+from cotarget.errors import CalibrationError, ConfigError, StaleFrameError, UnreachableError
 
 DIGITS = 4  # decimals of a latency [s]
 # Accuracy of a measured latency [s]; a more negative one is refused.
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
         """Keep a measured value for rig.toml; a failure is printed at the end, because the others are as good."""
         try:
             found[name] = _plausible(name, measure(), head.late)
-        except CalibrationError as error:
+        except (CalibrationError, StaleFrameError, UnreachableError) as error:
             found[name] = None
             failed.append(str(error) if name in str(error) else f"{name}: {error}")
 

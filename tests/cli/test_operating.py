@@ -15,7 +15,7 @@ from cotarget.config import RigConfig, SafetyConfig
 from cotarget.drivers import ptu_d46
 from cotarget.drivers.interlock import PositionLostMarker, rig_lock
 from cotarget.emulators.emulation import copied_tables
-from cotarget.errors import EmergencyStopError
+from cotarget.errors import EmergencyStopError, UnreachableError
 from cotarget.latency import Delay, HeadLatency
 from cotarget.safety.safe_rig import guard
 from cotarget.safety.stop_file import refuse_if_stopped
@@ -195,6 +195,18 @@ def test_latency_refuses_a_clearly_negative_delay(folder, capsys, monkeypatch, d
     assert status == (configured is None)
     if configured is None:
         assert err.splitlines()[-1].startswith("cotarget latency: sim.zoom.latency_s: -140 ms")
+
+
+def test_latency_prints_what_it_found_though_one_value_failed(folder, capsys, monkeypatch):
+    def fails(*_):
+        raise UnreachableError("the board is out of reach")
+
+    monkeypatch.setattr("cotarget.latency.measure_head", lambda rig: HeadLatency(Delay(0.0, 0.99), 0.04, 100))
+    monkeypatch.setattr("cotarget.latency.measure_fixed", fails)
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: rig_of(SimulatedDevices()))
+    status, out, err = call(capsys, "latency", "--rig", "sim.toml", "--calibration", "good.json", "--insist")
+    assert (status, json.loads(out)["measured"]["sim.zoom.latency_s"]) == (1, 0.06)
+    assert "sim.fixed.latency_s: the board is out of reach" in err
 
 
 @pytest.fixture
