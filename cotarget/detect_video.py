@@ -178,7 +178,7 @@ def labels_of_film(video: Path, file: Path) -> dict[int, list[Label]]:
     with Film(video) as film:
         width, height = film.size
         next(iter(film))  # one that cannot be decoded is refused now
-    centers = np.array([label.center_px for boxes in labels.values() for label in boxes])
+    centers = np.reshape([label.center_px for boxes in labels.values() for label in boxes], (-1, 2))
     outside = int(((centers < 0) | (centers >= (width, height))).any(axis=1).sum())
     if outside > len(centers) / 2:
         raise ConfigError(
@@ -241,8 +241,8 @@ def run_on_folder(
         progress: called before every film with (films done, films in all, what).
 
     Returns:
-        "pooled": scores over all films that have a labelled frame; "films": summary and score of each film, by its
-        name.
+        "pooled": scores over all films but those whose labels are all beyond their ends; "films": summary and score of
+        each film, by its name.
 
     Raises:
         CotargetError: a film or its labels cannot be read, or a file cannot be written.
@@ -255,7 +255,7 @@ def run_on_folder(
         summary = run_on_film(film, target, table, keep=True)
         tracks, frames = read_tracks(table), summary.last_frame + 1
         score = score_tracks(tracks, boxes, summary.rate_hz, frames, criterion=criterion)
-        if min(boxes) < frames:  # otherwise no labelled frame is in the film
+        if not boxes or min(boxes) < frames:  # otherwise no labelled frame is in the film
             scores.append(score)
             minutes += frames / summary.rate_hz / 60
         results[film.stem] = dataclasses.asdict(summary) | dataclasses.asdict(score)

@@ -27,6 +27,8 @@ LEARNING_FRAMES = 30
 # Classes of size, by the larger side of a label's box: up to the first, up to the second, and above [px].
 SIZES_PX = (24.0, 60.0)
 SIZE_NAMES = ("small", "medium", "large")
+WHOLE_IOU = 0.5  # least overlap of a box that holds the whole target and little else
+INSIDE = 0.5  # a track with more than this part of its box in a label's is on that target
 # Bonus of a pair of the frame before, above any similarity.
 KEPT = 1000.0
 
@@ -68,32 +70,54 @@ class Tracked(Box):
 
 @dataclass(frozen=True)
 class Criterion:
-    """When a track's box is on a label's box.
+    """When a track's box is on a label's box; the label's size alone decides which rule holds.
 
     Attributes:
-        iou: least intersection over union.
-        small_px: if the larger side of either box is at most this, the track's centre decides instead, because labels
-            of specks are several times as large as the speck. It must be within the larger side of a label that is as
-            small, and in the box of a larger label. 0 for overlap alone, inf for distance alone.
+        iou: least intersection over union with a label whose larger side is above `small_px`.
+        small_px: up to this larger side of a label [px], the centres must be at most that side apart, because labels of
+            specks are several times as large as the speck. 0 for overlap alone, inf for distance alone.
     """
 
-    iou: float = 0.3
+    iou: float = 0.5
     small_px: float = 24.0
 
     def similarity(self, labels: Sequence[Box], tracks: Sequence[Box]) -> Array:
         """Compare every label with every track: at least `iou` where the track is on the label, (labels, tracks)."""
-        if not labels or not tracks:
-            return np.zeros((len(labels), len(tracks)))
-        at, size = (np.array([getattr(each, name) for each in labels]) for name in ("center_px", "size_px"))
-        center, extent = (np.array([getattr(each, name) for each in tracks]) for name in ("center_px", "size_px"))
-        shared = intersection_areas(at, size, center, extent)
-        iou = shared / (np.add.outer(size.prod(axis=-1), extent.prod(axis=-1)) - shared)
-        side, off = size.max(axis=-1)[:, None], np.abs(at[:, None] - center)
-        distance = np.linalg.norm(off, axis=-1) / side
-        inside = (off <= size[:, None] / 2).all(axis=-1)
-        on = np.where(side <= self.small_px, distance <= 1, inside)
-        near = np.where(on, 1 - (1 - self.iou) * distance, -1.0)
-        return np.where(np.minimum(side, extent.max(axis=-1)) <= self.small_px, near, iou)
+        overlap = compare(labels, tracks)
+        side = np.array([label.larger_side_px for label in labels])[:, None]
+        distance = overlap.distance_px / side
+        near = np.where(distance <= 1, 1 - (1 - self.iou) * distance, -1.0)
+        return np.where(side <= self.small_px, near, overlap.iou)
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Comparison of every label with every track, (labels, tracks) each.
+
+    Attributes:
+        iou: intersection over union.
+        of_label: intersection over the label's area.
+        of_track: intersection over the track's area.
+        distance_px: distance of the centres [px].
+    """
+
+    iou: Array
+    of_label: Array
+    of_track: Array
+    distance_px: Array
+
+
+def compare(labels: Sequence[Box], tracks: Sequence[Box]) -> Overlap:
+    """Compare every label with every track."""
+    at, size, center, extent = (
+        np.reshape([getattr(each, name) for each in boxes], (-1, 2))
+        for boxes in (labels, tracks)
+        for name in ("center_px", "size_px")
+    )
+    area, area_of_track = size.prod(axis=-1)[:, None], extent.prod(axis=-1)
+    shared = intersection_areas(at, size, center, extent)
+    distance_px = np.linalg.norm(at[:, None] - center, axis=-1)
+    return Overlap(shared / (area + area_of_track - shared), shared / area, shared / area_of_track, distance_px)
 
 
 @dataclass(frozen=True)
@@ -139,7 +163,8 @@ class TrackScore:
         precision: `found` over `found` and `false_boxes`.
         mota: multiple object tracking accuracy, 1 - (missed + false boxes + switches) / boxes.
         idf1: F1 score of `id_found`.
-        sizes: boxes and recall by the larger side of the label: "small" up to 24 px, "medium" up to 60, "large" above.
+        sizes: scores by the larger side of the label: "small" up to 24 px, "medium" up to 60, "large" above; see
+            `_size_score`.
         targets: score of each target, by id.
     """
 
@@ -274,7 +299,7 @@ def _ratios(boxes: int, found: int, false_boxes: int, switches: int, id_found: i
 
 
 def _ratio(part: float, whole: float) -> float | None:
-    return part / whole if whole else None
+    return float(part / whole) if whole else None
 
 
 def _id_switches(matches: Sequence[FrameMatch]) -> int:
@@ -331,14 +356,47 @@ def _gaps(matches: Sequence[FrameMatch], rate_hz: float) -> int:
 
 
 def _sizes(matches: Sequence[FrameMatch]) -> dict[str, dict[str, float | None]]:
-    found, all_boxes = Counter[str](), Counter[str]()
+    """Score the labels of each class of size."""
+    found: dict[str, list[list[float]]] = {name: [] for name in SIZE_NAMES}
     for match in matches:
-        hit = [_size_name(label) for label, _ in match.pairs]
-        found.update(hit)
-        all_boxes.update(hit + [_size_name(label) for label in match.missed])
+        labels = [*(label for label, _ in match.pairs), *match.missed]
+        overlap = compare(labels, [*(track for _, track in match.pairs), *match.false, *match.excused])
+        iou = overlap.iou.max(axis=1, initial=0.0)
+        covered = np.where(overlap.iou == iou[:, None], overlap.of_label, 0.0).max(axis=1, initial=0.0)
+        nearest_px, tracks = overlap.distance_px.min(axis=1, initial=np.inf), (overlap.of_track > INSIDE).sum(axis=1)
+        for i, label in enumerate(labels):
+            area = float(label.size_px.prod())
+            found[_size_name(label)].append([i < len(match.pairs), area, iou[i], covered[i], nearest_px[i], tracks[i]])
+    return {name: _size_score(np.array(rows, dtype=float).reshape(-1, 6)) for name, rows in found.items()}
+
+
+def _size_score(rows: Array) -> dict[str, float | None]:
+    """Score labels of one class of size.
+
+    Args:
+        rows: of each label whether it was found, its area [px^2], its largest intersection over union with a track, the
+            part of it that this track covers, the distance of the nearest track's centre [px], and the number of tracks
+            that are inside it by more than INSIDE of their area, (labels, 6).
+
+    Returns:
+        `boxes`, `found`, `recall`; `whole`, part of the labels that a track overlaps by WHOLE_IOU; `iou` and `covered`,
+        their means; `dot_distance`, mean of exp(-distance / S), where S is the root of the labels' mean area (Xu et al.
+        2021), and 0 without a track; `with_tracks`, labels with a track inside, and `tracks_at_once`, the mean number
+        of tracks inside these.
+    """
+    found, area, iou, covered, nearest_px, tracks = rows.T
+    boxes, with_tracks = len(rows), int((tracks > 0).sum())
+    side_px = np.sqrt(area.mean()) if boxes else 1.0
     return {
-        name: {"boxes": all_boxes[name], "found": found[name], "recall": _ratio(found[name], all_boxes[name])}
-        for name in SIZE_NAMES
+        "boxes": boxes,
+        "found": int(found.sum()),
+        "recall": _ratio(found.sum(), boxes),
+        "whole": _ratio((iou >= WHOLE_IOU).sum(), boxes),
+        "iou": _ratio(iou.sum(), boxes),
+        "covered": _ratio(covered.sum(), boxes),
+        "dot_distance": _ratio(np.exp(-nearest_px / side_px).sum(), boxes),
+        "with_tracks": with_tracks,
+        "tracks_at_once": _ratio(tracks.sum(), with_tracks),
     }
 
 
@@ -380,10 +438,6 @@ def pooled(scores: Sequence[TrackScore], minutes: float) -> dict[str, object]:
         sum(getattr(each, name) for each in scores)
         for name in ("boxes", "found", "false_boxes", "id_switches", "id_found", "false_tracks")
     )
-    sizes = {}
-    for name in SIZE_NAMES:
-        hit, of = (int(sum(each.sizes[name][key] or 0 for each in scores)) for key in ("found", "boxes"))
-        sizes[name] = {"boxes": of, "found": hit, "recall": _ratio(hit, of)}
     targets = [target for each in scores for target in each.targets.values()]
     recalls = [each.recall for each in scores if each.recall is not None]
     return {
@@ -393,12 +447,24 @@ def pooled(scores: Sequence[TrackScore], minutes: float) -> dict[str, object]:
         "id_switches": switches,
         "false_tracks": false,
         "false_tracks_per_min": _ratio(false, minutes),
-        "sizes": sizes,
+        "sizes": {name: _pooled_sizes([each.sizes[name] for each in scores]) for name in SIZE_NAMES},
         "numbers_median": _median([each.numbers for each in targets if each.numbers]),
         "first_track_s_median": _median([each.first_track_s for each in targets if each.first_track_s is not None]),
         "recall_median": _median(recalls),
         "recall_least": min(recalls, default=None),
     }
+
+
+def _pooled_sizes(scores: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
+    """Pool the scores of one class of size over films; means are weighted by the labels that they are over."""
+    counts = {name: int(sum(each[name] or 0 for each in scores)) for name in ("boxes", "found", "with_tracks")}
+    over = dict.fromkeys(("recall", "whole", "iou", "covered", "dot_distance"), "boxes")
+    over["tracks_at_once"] = "with_tracks"
+    means = {
+        name: _ratio(sum((each[name] or 0) * (each[of] or 0) for each in scores), counts[of])
+        for name, of in over.items()
+    }
+    return counts | means
 
 
 def _median(values: Sequence[float]) -> float | None:
@@ -450,10 +516,11 @@ def read_labels(path: Path) -> dict[int, list[Label]]:
 
     The csv has the columns of `LABELS`, all from 0, of the box's top-left pixel; with a column `target`, that is the
     target's id, and otherwise the first box of every frame belongs to target 1, and so on. A file of the MOT-challenge
-    has no header; its frames and pixels count from 1, and boxes marked with 0 do not count.
+    has no header; its frames and pixels count from 1, and boxes marked with 0 do not count. A file without rows is of a
+    film without targets.
 
     Raises:
-        ConfigError: the file is missing, is no such table, has no row, or one target has two boxes in a frame.
+        ConfigError: the file is missing, is no such table, or one target has two boxes in a frame.
     """
     labels: dict[int, list[Label]] = {}
     for frame, target, x, y, width, height, counts in _label_rows(path):
@@ -472,13 +539,13 @@ def read_labels(path: Path) -> dict[int, list[Label]]:
                 f"{path}: frame {frame:g} has two boxes of target {number}; each wants a number of its own"
             )
         boxes.append(Label(np.array([x, y]) + (size - 1) / 2, size, number, bool(counts)))
-    if not labels:
-        raise ConfigError(f"{path}: holds no label, but for the names of its columns; it wants a row for each box")
     return labels
 
 
 def _label_rows(path: Path) -> Iterable[tuple[float, float | None, float, float, float, float, float]]:
     """Rows of a file of labels: frame and target, left, top, width and height, all from 0, and whether it counts."""
+    if path.is_file() and path.stat().st_size == 0:
+        return
     if _is_mot(path):
         what = "ground truth of the MOT-challenge"
         for row in read_table(path, dict.fromkeys(MOT_COLUMNS, _finite) | {"id": _whole}, what, names=MOT_COLUMNS):

@@ -124,7 +124,8 @@ def test_three_frames_by_hand():
     # Track 2 is on target 1 in two frames, and track 1 on target 2 in one.
     assert (score.id_found, score.idf1) == (3, 2 * 3 / (6 + 6))
     assert [(each.boxes, each.recall, each.numbers) for each in score.targets.values()] == [(3, 1.0, 2), (3, 2 / 3, 2)]
-    assert score.sizes["medium"] == {"boxes": 6, "found": 5, "recall": 5 / 6}
+    sizes = score.sizes["medium"]
+    assert (sizes["boxes"], sizes["found"], sizes["recall"]) == (6, 5, 5 / 6)
 
 
 @pytest.mark.parametrize(("off", "iou", "small_px", "found"), [
@@ -140,11 +141,35 @@ def test_small_boxes_are_matched_by_distance_and_others_by_overlap(off, iou, sma
     assert score_tracks(tracks, labels, RATE, 1, 0, Criterion(iou, small_px)).found == found
 
 
-@pytest.mark.parametrize(("off", "found"), [(95, 1), (105, 0), (190, 0)])
-def test_the_centre_of_a_small_track_is_in_the_box_of_a_large_label(off, found):
-    labels, at = {0: [Label(np.array([300.0, 300.0]), np.array([200.0, 200.0]))]}, np.array([300.0 + off, 300.0])
-    tracks = [Tracked(at, np.array([10.0, 10.0]), 0, 0.0, 1)]
-    assert score_tracks(tracks, labels, RATE, 1, 0).found == found
+@pytest.mark.parametrize(("label_px", "track_px", "found"), [
+    (200.0, 20.0, 0), (200.0, 60.0, 0), (200.0, 141.0, 0), (200.0, 142.0, 1), (24.0, 60.0, 1), (25.0, 60.0, 0),
+])  # fmt: skip
+def test_the_labels_size_alone_decides_by_which_rule_it_is_matched(label_px, track_px, found):
+    """Squares with one centre: 142 of 200 px are an overlap of 0.504."""
+    at = np.array([300.0, 300.0])
+    tracks = [Tracked(at, np.full(2, track_px), 0, 0.0, 1)]
+    assert score_tracks(tracks, {0: [Label(at, np.full(2, label_px))]}, RATE, 1, 0).found == found
+
+
+def test_a_class_of_size_says_how_much_of_its_targets_the_tracks_hold():
+    """By hand: boxes of 20x40; one with a whole track and a part of 10x20, one with a track 10 px off, one missed."""
+    labels = boxes_of(Label, [(0, 1, 100), (1, 1, 100), (2, 1, 100)])
+    tracks = boxes_of(Tracked, [(0, 1, 100), (1, 1, 110)])
+    tracks.append(Tracked(np.array([104.0, 55.0]), np.array([10.0, 20.0]), 0, 0.0, 2))
+    one = score_tracks(tracks, labels, RATE, 3, 0)
+    expected = {
+        "boxes": 3, "found": 1, "recall": 1 / 3, "whole": 1 / 3,
+        "iou": (1 + 1 / 3) / 3, "covered": (1 + 1 / 2) / 3, "dot_distance": (1 + math.exp(-10 / math.sqrt(800))) / 3,
+        "with_tracks": 1, "tracks_at_once": 2.0,  # just half of the track is inside in the second frame
+    }  # fmt: skip
+    assert one.sizes["medium"] == pytest.approx(expected)
+    two = score_tracks(boxes_of(Tracked, [(0, 1, 100)]), boxes_of(Label, [(0, 1, 100)]), RATE, 1, 0)
+    sizes = pooled([one, two], 1.0)["sizes"]
+    assert sizes["medium"] == pytest.approx(expected | {
+        "boxes": 4, "found": 2, "recall": 2 / 4, "whole": 2 / 4, "iou": (2 + 1 / 3) / 4, "covered": (2 + 1 / 2) / 4,
+        "dot_distance": (2 + math.exp(-10 / math.sqrt(800))) / 4, "with_tracks": 2, "tracks_at_once": 3 / 2,
+    })  # fmt: skip
+    assert sizes["large"] == dict.fromkeys(expected) | {"boxes": 0, "found": 0, "with_tracks": 0}
 
 
 def test_two_boxes_of_one_target_in_a_frame_are_refused(tmp_path):
@@ -239,7 +264,7 @@ def test_ground_truth_of_the_mot_challenge_counts_from_one(tmp_path):
     (["1,2,3,4,5", "2,nan,3,4,5"], HEAD, "line 3 has 'nan' for x_px"),
     (["1,2,3,x,5"], HEAD, "line 2 has 'x' for width_px"), (["", "1,2,3,x,5"], HEAD, "line 3 has 'x' for width_px"),
     (["1,2,3,4,5,1.5"], f"{HEAD},target", "line 2 has '1.5' for target"), (["1,2,3,0,5"], HEAD, "a label"),
-    (["1.5,2,3,4,5"], HEAD, "a label"), (["-1,2,3,4,5"], HEAD, "a label"), ([], HEAD, "no label"),
+    (["1.5,2,3,4,5"], HEAD, "a label"), (["-1,2,3,4,5"], HEAD, "a label"),
 ])  # fmt: skip
 def test_an_invalid_table_of_labels_is_refused(tmp_path, rows, head, named):
     with pytest.raises(ConfigError, match=rf"labels\.csv: .*{named}"):
@@ -275,6 +300,23 @@ def test_the_command_scores_a_film(tmp_path, capsys):
     assert found["false_tracks"] == 0
     assert found["offset_px_median"] < 1.5
     assert len(read_tracks(tmp_path / "tracks.csv")) >= 50
+
+
+@pytest.mark.parametrize("empty", ["", f"{HEAD}\n"])
+def test_a_file_without_labels_is_of_a_film_without_targets(tmp_path, capsys, empty):
+    """The square that flies for 80 frames of 25 a second is then a false track."""
+    write_film(tmp_path / "film.mp4")
+    (tmp_path / "film.csv").write_text(empty)
+    (tmp_path / "tables").mkdir()
+    for film, labels, table in (("film.mp4", "film.csv", "tracks.csv"), ("", "", "tables")):
+        given = ["--target", "bird", "--csv", str(tmp_path / table), "--labels", str(tmp_path / labels)]
+        assert main(["detect", str(tmp_path / film), *given]) == 0
+        out, err = capsys.readouterr()
+        assert "nothing is scored" not in err
+        found = json.loads(out)
+        found = found.get("pooled", found)
+        assert (found["recall"], found["boxes"], found["false_tracks"]) == (None, 0, 1)
+        assert found["false_tracks_per_min"] == pytest.approx(60 * RATE / 80)
 
 
 @pytest.mark.parametrize(("more", "used"), [((), "speck"), (("--detector", "auto"), "auto")])

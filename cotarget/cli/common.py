@@ -113,7 +113,7 @@ def warn_unscored(file: Path | None, beyond: int, scored: int, labelled: int, la
     """Warn on stderr of labelled frames beyond a film's last one, or if all are among the first, which do not count."""
     from cotarget.track_metrics import LEARNING_FRAMES
 
-    if not beyond and not scored:
+    if labelled and not beyond and not scored:
         print(f"{file}: nothing is scored; all labels are in the first {LEARNING_FRAMES} frames", file=sys.stderr)
     if beyond:
         print(

@@ -41,16 +41,14 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_file(parser, "--rig", "rig.toml, for targets of your own")
     about = (
         "score the tracks by these boxes: a csv with frame,x_px,y_px,width_px,height_px, all from 0; x and y are of "
-        "the box's top-left pixel; or ground truth of the MOT-challenge; for a folder of videos, a folder"
+        "the box's top-left pixel; or ground truth of the MOT-challenge; a file without boxes for a video without "
+        "targets; for a folder of videos, a folder"
     )
     add_file(parser, "--labels", about)
     add_file(parser, "--sheet", "write a picture of the longest misses and false tracks in a folder of videos", "PNG")
-    about = "least intersection over union of a track on a label (0.3)"
-    parser.add_argument("--iou", type=ratio, default=0.3, metavar="R", help=about)
-    about = (
-        "judge boxes up to this side by their centres: at most the label's larger side apart, or the track's in a "
-        "larger label (24)"
-    )
+    about = "least intersection over union of a track on a label above --small-px (0.5)"
+    parser.add_argument("--iou", type=ratio, default=0.5, metavar="R", help=about)
+    about = "judge labels up to this larger side by the centres: at most that side apart (24)"
     parser.add_argument("--small-px", type=length, default=24.0, metavar="N", help=about)
 
 

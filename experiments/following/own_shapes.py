@@ -20,7 +20,7 @@ from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 from cotarget.sim.targets.random_paths import lone_path
 from cotarget.sim.world import SimWorld
-from cotarget.track_metrics import Box, Label, score_tracks
+from cotarget.track_metrics import Box, Criterion, Label, score_tracks
 from cotarget.tracking.track import tracking_settings
 from experiments.engine import Count, Row
 from experiments.following import films
@@ -32,6 +32,7 @@ from experiments.tables import grouped
 
 __all__ = ["needs"]
 WANTED = 0.95
+ON_TARGET = Criterion(iou=0.3)
 EVERY = 5  # the labelled films that are taken: every fifth
 # Composites: length [px], speed [lengths per second], and number of heights of which the farthest from labels is taken.
 LENGTH_PX, SPEED, HEIGHTS = (24.0, 120.0), (0.5, 2.0), 50
@@ -140,7 +141,7 @@ def one(settings: OwnShapesSettings, number: int) -> list[Row]:
             "composite": composite(film, shape, number, settings.frames),
         }.items():
             tracks = tracks_of(make_detector(target, clip.rate_hz), target, (least,), clip.frames)[least]
-            score = score_tracks(tracks, clip.labels, clip.rate_hz, len(clip.frames))
+            score = score_tracks(tracks, clip.labels, clip.rate_hz, len(clip.frames), criterion=ON_TARGET)
             if not score.boxes:
                 continue
             sides = [each.larger_side_px for boxes in clip.labels.values() for each in boxes]

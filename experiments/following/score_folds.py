@@ -110,7 +110,7 @@ def examined(film: LabelledFilm) -> tuple[Array, Array]:
 
 def _is_on(box: Box, boxes: Sequence[Box]) -> bool:
     """Whether a box is on one of some boxes."""
-    criterion = Criterion()
+    criterion = Criterion(iou=0.3)
     return bool((criterion.similarity(boxes, [box]) >= criterion.iou).any())
 
 

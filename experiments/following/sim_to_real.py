@@ -29,7 +29,7 @@ from cotarget.geometry import Array
 from cotarget.metrics import WHOLLY_VISIBLE
 from cotarget.rig import Frame, Image
 from cotarget.sim.world import SimWorld
-from cotarget.track_metrics import LEARNING_FRAMES, Box, Label, Tracked, match_frames
+from cotarget.track_metrics import LEARNING_FRAMES, Box, Criterion, Label, Tracked, match_frames
 from cotarget.tracking.track import tracking_settings
 from cotarget.video import Film
 from experiments.engine import Count, Row
@@ -137,7 +137,7 @@ def scores(tracks: Sequence[Tracked], labels: Labels, where: Mapping[tuple[int, 
         where: stratum by frame number and target.
     """
     boxes, errors = Counter[str](), dict[str, list[float]]()
-    for match in match_frames(tracks, labels):
+    for match in match_frames(tracks, labels, Criterion(iou=0.3)):
         if match.frame < LEARNING_FRAMES:
             continue
         boxes.update(where[match.frame, label.target] for label in [*match.missed, *(pair[0] for pair in match.pairs)])

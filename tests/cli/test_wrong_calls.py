@@ -157,7 +157,7 @@ CALLS = [
     (f"{DETECT} new.csv --labels other.csv", FAILED, "other.csv", "frame, x_px", "separated by commas"),
     (f"{DETECT} new.csv --video new.txt", FAILED, "new.txt", ".mp4"),
     (f"{DETECT} new.csv --labels cut.txt", FAILED, "cut.txt", "line 1 is cut off; it wants frame, id, left"),
-    (f"{DETECT} new.csv --iou 0.5", FAILED, "--iou", "--labels"),
+    (f"{DETECT} new.csv --iou 0.3", FAILED, "--iou", "--labels"),
     (f"{DETECT} new.csv --small-px 9", FAILED, "--small-px", "--labels"),
     (f"{DETECT} - --labels late.csv", FAILED, "--labels", "--csv"),
     ("doctor --rig typo.toml", FAILED, "typo.toml", "sim.scenery"),
