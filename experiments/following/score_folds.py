@@ -2,7 +2,7 @@
 
 The weights of `cotarget.detection.small_target.small_target_score` are fitted to four fifths of the labelled films of
 `experiments.following.films`. The others are searched with these weights, with those fitted to all films, and with the
-usual ones. Films of one place and day are in one fifth; `film_places.csv` lists them, by their backgrounds.
+usual ones. Films of one place and day are in one fifth; `film_division.csv` lists them, by their backgrounds.
 
 A region that the detector examines in a labelled frame is a target if it is on a label. Logistic regression takes
 targets and others as equally likely in every film.
@@ -31,7 +31,7 @@ from experiments.following.films import FolderSettings, LabelledFilm, labelled_f
 from experiments.tables import grouped
 
 __all__ = ["needs"]
-PLACES = Path(__file__).with_name("film_places.csv")
+PLACES = Path(__file__).with_name("film_division.csv")
 FOLDS = 5
 WITHIN = 0.01  # of the recall with weights fitted to all films
 USUAL, ALL, OTHERS = "usual weights", "fitted to all films", "fitted to the other films"
