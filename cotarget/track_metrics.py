@@ -447,7 +447,7 @@ def pooled(scores: Sequence[TrackScore], minutes: float) -> dict[str, object]:
         "id_switches": switches,
         "false_tracks": false,
         "false_tracks_per_min": _ratio(false, minutes),
-        "sizes": {name: _pooled_sizes([each.sizes[name] for each in scores]) for name in SIZE_NAMES},
+        "sizes": {name: pooled_sizes([each.sizes[name] for each in scores]) for name in SIZE_NAMES},
         "numbers_median": _median([each.numbers for each in targets if each.numbers]),
         "first_track_s_median": _median([each.first_track_s for each in targets if each.first_track_s is not None]),
         "recall_median": _median(recalls),
@@ -455,7 +455,7 @@ def pooled(scores: Sequence[TrackScore], minutes: float) -> dict[str, object]:
     }
 
 
-def _pooled_sizes(scores: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
+def pooled_sizes(scores: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
     """Pool the scores of one class of size over films; means are weighted by the labels that they are over."""
     counts = {name: int(sum(each[name] or 0 for each in scores)) for name in ("boxes", "found", "with_tracks")}
     over = dict.fromkeys(("recall", "whole", "iou", "covered", "dot_distance"), "boxes")

@@ -32,7 +32,6 @@ from experiments.tables import grouped
 
 __all__ = ["needs"]
 WANTED = 0.95
-ON_TARGET = Criterion(iou=0.3)
 EVERY = 5  # the labelled films that are taken: every fifth
 # Composites: length [px], speed [lengths per second], and number of heights of which the farthest from labels is taken.
 LENGTH_PX, SPEED, HEIGHTS = (24.0, 120.0), (0.5, 2.0), 50
@@ -141,7 +140,7 @@ def one(settings: OwnShapesSettings, number: int) -> list[Row]:
             "composite": composite(film, shape, number, settings.frames),
         }.items():
             tracks = tracks_of(make_detector(target, clip.rate_hz), target, (least,), clip.frames)[least]
-            score = score_tracks(tracks, clip.labels, clip.rate_hz, len(clip.frames), criterion=ON_TARGET)
+            score = score_tracks(tracks, clip.labels, clip.rate_hz, len(clip.frames), criterion=Criterion(iou=0.3))
             if not score.boxes:
                 continue
             sides = [each.larger_side_px for boxes in clip.labels.values() for each in boxes]

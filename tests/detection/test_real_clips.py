@@ -13,25 +13,14 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detect_video import run_on_film
-from cotarget.track_metrics import Criterion, Label, read_labels, read_tracks, score_tracks
+from cotarget.track_metrics import Criterion, read_labels, read_tracks, score_tracks
+from experiments.following.films import OF_FLYERS, labels_of, off_boxes, unlabelled_flyers
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 VTEST_LABELS = Path(__file__).resolve().parents[1] / "data" / "vtest.txt"
 LEAST_COVERAGE = 0.95
 MOST_NUMBERS = 2
 MOST_FALSE_PER_MINUTE = 3.0
-
-
-FIRST_PIXEL = 1.0  # the labels count pixels from 1, as MATLAB does
-# Clip 016 shows a second bird that has no label: (frame, u, v), read off the pictures by eye.
-UNLABELLED = {"V_BIRD_016": ((40, 168, 336), (55, 200, 384), (70, 234, 435), (80, 253, 488))}
-BY_EYE_PX = 25.0
-
-
-def with_unlabelled(labels, clip):
-    """The same with what is there and was not labelled."""
-    more = {frame: Label(np.array([u, v]), 2 * np.full(2, BY_EYE_PX)) for frame, u, v in UNLABELLED.get(clip, ())}
-    return labels | {frame: [*labels.get(frame, []), label] for frame, label in more.items()}
 
 
 def need(path):
@@ -41,17 +30,15 @@ def need(path):
 
 
 def watch(clip, detector, folder):
-    """Run detector and tracker on a clip: its score by the labels, and the false tracks of those."""
+    """Run detector and tracker on a clip: its score by the labels, with false tracks off the flyers without a label."""
     film, table = need(DATA / "birds" / f"{clip}.mp4"), need(DATA / "birds" / f"{clip}.csv")
     target = dataclasses.replace(DEFAULT_TARGETS["bird"], detector=detector)
     summary = run_on_film(film, target, folder / "tracks.csv")
     tracks = read_tracks(folder / "tracks.csv")
-    labels = {
-        frame: [dataclasses.replace(label, center_px=label.center_px - FIRST_PIXEL) for label in boxes]
-        for frame, boxes in read_labels(table).items()
-    }
-    result = score_tracks(tracks, labels, summary.rate_hz, summary.frames)
-    known = score_tracks(tracks, with_unlabelled(labels, clip), summary.rate_hz, summary.frames)
+    result, known = (
+        score_tracks(found, labels_of(table), summary.rate_hz, summary.frames, criterion=OF_FLYERS)
+        for found in (tracks, off_boxes(tracks, unlabelled_flyers(clip), OF_FLYERS))
+    )
     print(
         f"{clip}, {detector}: on the bird in {result.on_target_ratio:.1%} of the labelled frames, track numbers "
         f"{result.numbers}, false tracks {known.false_tracks} "
