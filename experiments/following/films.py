@@ -11,9 +11,9 @@ tracks. Scores are those of `cotarget.track_metrics`.
 
 The mixtures' foreground is grouped with gaps of 3 px, and tracked by the same tracker. Figures are of each way's usual
 setting, and of the best one at a given rate of false tracks: the detector is swept over the score from which a track is
-confirmed, the mixtures over threshold and smallest area. SuBSENSE (St-Charles et al. 2015) may be added by
-`--set 'films.others=["MOG2", "KNN", "SuBSENSE"]'`. It is that of bgslibrary, which PyPI has as a source package for
-Debian's OpenCV, and computes three frames a second.
+confirmed, the mixtures over threshold and smallest area. SuBSENSE (St-Charles et al. 2015) may take the mixtures'
+place. It is that of bgslibrary, which PyPI has as a source package for Debian's OpenCV, and computes three frames a
+second.
 """
 
 import contextlib
@@ -37,11 +37,13 @@ from cotarget.files import read_table
 from cotarget.pipeline import CameraRun
 from cotarget.rig import Detection, Frame, Image
 from cotarget.track_metrics import (
+    INSIDE,
     SIZE_NAMES,
     Box,
     Criterion,
     Label,
     Tracked,
+    compare,
     pooled_sizes,
     read_labels,
     score_tracks,
@@ -56,6 +58,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+FLYERS = ("flyers", "birds")  # folders there whose films are all of flyers
 DIVISION, LABELS = Path(__file__).with_name("film_division.csv"), Path(__file__).with_name("film_labels")
 # Flyers of these films that have no label, found by looking at every false track: a box about every fifth frame. One is
 # listed while it is seen to fly, not where it is lost among twigs.
@@ -81,21 +84,20 @@ B = TypeVar("B", bound=Box)
 
 @dataclass(frozen=True)
 class FolderSettings(Settings):
-    """Settings of all experiments on flyers: folders of films with their labels, and most films, as seeds."""
+    """Settings of all experiments on flyers: where the folders of films and labels are, and most films, as seeds."""
 
     seeds: Count = 1000
-    folders: tuple[str, ...] = (str(DATA / "flyers"), str(DATA / "birds"))
+    data: str = str(DATA)
 
 
 @dataclass(frozen=True)
 class FilmsSettings(FolderSettings):
     """Settings: the half of the films, how they are altered, the ways, and what is swept."""
 
-    folders: tuple[str, ...] = tuple(str(DATA / name) for name in ("flyers", "birds", "films", "people"))
     half: Literal["development", "report"] = "development"
     altered: Literal["no", "half", "a third", "twice", "shaken", "dropped", "compressed"] = "no"
     detector: DetectorName = "auto"
-    others: tuple[Literal["MOG2", "KNN", "SuBSENSE"], ...] = ("MOG2", "KNN")
+    beside: Literal["mixtures", "SuBSENSE", "nothing"] = "mixtures"
     scores: tuple[float, ...] = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99)  # from which a track is confirmed
     thresholds: tuple[float, ...] = (THRESHOLD, 100.0, 400.0)  # of MOG2, in variances
     areas_px: tuple[int, ...] = (AREA_PX, 64, 256)  # smallest of a component
@@ -106,21 +108,22 @@ class FilmsSettings(FolderSettings):
 
 def needs(settings: FolderSettings) -> str:
     """Describe what is missing to run; empty if nothing."""
-    if isinstance(settings, FilmsSettings) and "SuBSENSE" in settings.others and not importlib.util.find_spec("pybgs"):
+    if isinstance(settings, FilmsSettings) and settings.beside == "SuBSENSE" and not importlib.util.find_spec("pybgs"):
         return "needs bgslibrary, in an environment of its own"
-    lacking = [folder for folder in settings.folders if not Path(folder).is_dir()]
-    return f"needs films in {lacking[0]}, which are not part of the project" if lacking else ""
+    lacking = [folder for folder in FLYERS if not Path(settings.data, folder).is_dir()]
+    return f"needs films in {settings.data}/{lacking[0]}, which are not part of the project" if lacking else ""
 
 
 def films(settings: FolderSettings) -> list[tuple[Path, Path]]:
     """List all films of flyers and their labels."""
-    return [pair for folder in settings.folders for pair in labelled_films(Path(folder), Path(folder))]
+    folders = [Path(settings.data, name) for name in FLYERS]
+    return [pair for folder in folders for pair in labelled_films(folder, folder)]
 
 
 def films_of_half(settings: FilmsSettings) -> list[Path]:
     """List the films of a half."""
     rows = read_table(DIVISION, {"film": str, "half": str}, "division of films")
-    there = {path.stem: path for folder in settings.folders for path in Path(folder).iterdir() if path.suffix in FILMS}
+    there = {path.stem: path for path in Path(settings.data).glob("*/*") if path.suffix in FILMS}
     return [there[row["film"]] for row in rows if row["half"] == settings.half and row["film"] in there]
 
 
@@ -159,9 +162,10 @@ class LabelledFilm:
     def row(self, way: str, threshold: float, area: int, tracks: Iterable[Tracked]) -> Row:
         """Score the tracks of a way with a threshold and a smallest area [px]."""
         tracks = list(tracks)
-        score, others = (
+        others = off_boxes(tracks, self.flyers, self.criterion)
+        score, no_flyer, no_part = (
             score_tracks(found, self.labels, self.rate_hz, len(self.frames), criterion=self.criterion)
-            for found in (tracks, off_boxes(tracks, self.flyers, self.criterion))
+            for found in (tracks, others, no_parts(others, self.labels))
         )
         numbers = [each.numbers for each in score.targets.values() if each.numbers]
         delays_s = [each.first_track_s for each in score.targets.values() if each.first_track_s is not None]
@@ -171,7 +175,8 @@ class LabelledFilm:
             "threshold": threshold,
             "smallest_px": area,
             **{name: getattr(score, name) for name in ("boxes", "found", "false_boxes", "id_found", "false_tracks")},
-            "no_flyer": others.false_tracks,
+            "no_flyer": no_flyer.false_tracks,
+            "no_part": no_part.false_tracks,
             "minutes": len(self.frames) / self.rate_hz / 60,
             "numbers": float(np.median(numbers)) if numbers else None,
             "first_track_s": float(np.median(delays_s)) if delays_s else None,
@@ -228,6 +233,11 @@ def off_boxes(tracks: Iterable[Tracked], boxes: Mapping[int, Sequence[Box]], cri
         excused: list[bool] = np.any(near, axis=0).tolist()
         kept += [each for each, excuse in zip(found, excused, strict=True) if not excuse]
     return kept
+
+
+def no_parts(tracks: Iterable[Tracked], labels: Mapping[int, Sequence[Label]]) -> list[Tracked]:
+    """Leave out what is mostly inside a label: parts of its target."""
+    return [each for each in tracks if not (compare(labels.get(each.frame, ()), [each]).of_track > INSIDE).any()]
 
 
 # Altered films
@@ -311,11 +321,12 @@ def one(settings: FilmsSettings, number: int) -> list[Row]:
     usual = tracking_settings(target).confirm_score
     found = tracks_of(make_detector(target, film.rate_hz), target, sorted({usual, *settings.scores}), film.frames)
     ways = {(settings.detector, least, 0): tracks for least, tracks in found.items()}
-    for way, threshold in itertools.product(settings.others, settings.thresholds):
+    others: Mapping[str, Sequence[str]] = {"mixtures": list(MIXTURES), "SuBSENSE": ["SuBSENSE"], "nothing": []}
+    for way, threshold in itertools.product(others[settings.beside], settings.thresholds):
         subtract = subtractor(way, threshold)
         for area, tracks in foreground_tracks(subtract, settings.areas_px, film.frames, film.target).items():
             ways[way, threshold, area] = tracks
-    usuals = [(settings.detector, usual, 0), *((way, THRESHOLD, AREA_PX) for way in settings.others)]
+    usuals = [(settings.detector, usual, 0), *((way, THRESHOLD, AREA_PX) for way in others[settings.beside])]
     labels = "redrawn" if film.published else "all"
     rows = [film.row(*way, tracks) | {"usual": way in usuals, "labels": labels} for way, tracks in ways.items()]
     if film.published:
@@ -438,9 +449,9 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
 def figures(rows: Sequence[Row]) -> dict[str, float]:
     """Pool the figures of films of flyers."""
     small, medium, large = (pooled_sizes([_size(row, name) for row in rows]) for name in SIZE_NAMES)
-    boxes, found, false_boxes, id_found, false, no_flyer, minutes = (
+    boxes, found, false_boxes, id_found, false, no_flyer, no_part, minutes = (
         sum(row[name] for row in rows)
-        for name in ("boxes", "found", "false_boxes", "id_found", "false_tracks", "no_flyer", "minutes")
+        for name in ("boxes", "found", "false_boxes", "id_found", "false_tracks", "no_flyer", "no_part", "minutes")
     )
     pooled = {
         "films": len(rows),
@@ -455,6 +466,7 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
         "overlap to 24 px": small["iou"],
         "false tracks a minute": _part(false, minutes),
         "the same, no flyer": _part(no_flyer, minutes),
+        "the same, no part of a target": _part(no_part, minutes),
         "precision": _part(found, found + false_boxes),
         "IDF1": _part(2 * id_found, boxes + found + false_boxes),
         "numbers a target": _median([row["numbers"] for row in rows]),

@@ -19,6 +19,7 @@ from experiments.following.films import (
     dropped,
     film_to_score,
     films_of_half,
+    no_parts,
     off_boxes,
     unlabelled_flyers,
 )
@@ -49,7 +50,8 @@ def row(name, way, threshold, found, false_tracks, **more):
     sizes = {"small": small, "medium": none, "large": none}
     return {
         "film": name, "way": way, "threshold": threshold, "smallest_px": 0, "boxes": 100, "found": found,
-        "false_boxes": 0, "id_found": found, "false_tracks": false_tracks, "no_flyer": false_tracks, "minutes": 1.0,
+        "false_boxes": 0, "id_found": found, "false_tracks": false_tracks, "no_flyer": false_tracks,
+        "no_part": false_tracks, "minutes": 1.0,
         "numbers": 1.0, "first_track_s": 0.5, "usual": True, "labels": "all",
         **{f"{size} {key}": sizes[size][key] for size in SIZE_NAMES for key in films.SIZE_KEYS},
     } | more  # fmt: skip
@@ -96,12 +98,13 @@ def test_redrawn_labels_take_the_place_of_the_published_ones(tmp_path, monkeypat
     monkeypatch.setattr(films, "DIVISION", tmp_path / "division.csv")
     (tmp_path / "own").mkdir()
     (tmp_path / "division.csv").write_text("film,half\none,report\ntwo,report\nother,development\nabsent,report\n")
-    for name in ("one", "two", "other"):
+    for name in ("flyers/one", "birds/two", "flyers/other"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         with FilmWriter(tmp_path / f"{name}.mp4", RATE) as out:
             out.write(film(1).frames[0].image, 0.0)
         (tmp_path / f"{name}.csv").write_text("frame,x_px,y_px,width_px,height_px\n0,11,21,5,5\n")
     (tmp_path / "own" / "two.csv").write_text("frame,x_px,y_px,width_px,height_px\n0,30,40,5,5\n")
-    one, two = map(film_to_score, films_of_half(FilmsSettings(folders=(str(tmp_path),), half="report")))
+    one, two = map(film_to_score, films_of_half(FilmsSettings(data=str(tmp_path), half="report")))
     assert (one.name, one.labels[0][0].center_px.tolist(), one.published) == ("one", [12.0, 22.0], {})
     assert (two.name, two.labels[0][0].center_px.tolist()) == ("two", [32.0, 42.0])
     assert two.published[0][0].center_px.tolist() == [12.0, 22.0]
@@ -132,6 +135,14 @@ def test_what_lies_on_a_box_that_must_not_count_is_left_out():
         for at, frame in (([53.0, 50.0], 3), ([70.0, 50.0], 3), ([50.0, 50.0], 4))
     )
     assert off_boxes([on, off, later], {3: [bird]}, Criterion()) == [off, later]
+
+
+def test_parts_of_a_target_are_told_from_other_false_tracks():
+    """A square of 40 px with a track on its corner, one half inside, and one beside it."""
+    label = Label(np.array([50.0, 50.0]), np.array([40.0, 40.0]))
+    part, half, beside = (Tracked(np.array([u, 60.0]), np.array([10.0, 10.0]), 3, 0.1, 1) for u in (64.0, 70.0, 80.0))
+    assert no_parts([part, half, beside], {3: [label]}) == [half, beside]
+    assert no_parts([part], {4: [label]}) == [part]
 
 
 def dark(frame):
