@@ -11,9 +11,8 @@ tracks. Scores are those of `cotarget.track_metrics`.
 
 The mixtures' foreground is grouped with gaps of 3 px, and tracked by the same tracker. Figures are of each way's usual
 setting, and of the best one at a given rate of false tracks: the detector is swept over the score from which a track is
-confirmed, the mixtures over threshold and smallest area. SuBSENSE (St-Charles et al. 2015) may take the mixtures'
-place. It is that of bgslibrary, which PyPI has as a source package for Debian's OpenCV, and computes three frames a
-second.
+confirmed, the mixtures over threshold and smallest area. SuBSENSE (St-Charles et al. 2015) may take their place; it is
+that of bgslibrary, a source package on PyPI for Debian's OpenCV, and computes three frames a second.
 """
 
 import contextlib
@@ -75,8 +74,7 @@ THRESHOLD, AREA_PX = 16.0, 16
 # False tracks a minute at which the ways are compared, and by how much the detector must be ahead.
 FALSE_PER_MIN = (0.5, 5.0)
 AHEAD = 0.05
-# Gaps that are closed in the mixtures' foreground [px].
-BRIDGE_PX = (3, 3)
+BRIDGE_PX = (3, 3)  # gaps that are closed in the mixtures' foreground
 SIZE_KEYS = ("boxes", "found", "recall", "whole", "iou", "covered", "dot_distance", "with_tracks", "tracks_at_once")
 SHAKE_PX, DROPPED, QUALITY = 1.0, 0.3, 25
 B = TypeVar("B", bound=Box)
@@ -165,7 +163,7 @@ class LabelledFilm:
         others = off_boxes(tracks, self.flyers, self.criterion)
         score, no_flyer, no_part = (
             score_tracks(found, self.labels, self.rate_hz, len(self.frames), criterion=self.criterion)
-            for found in (tracks, others, no_parts(others, self.labels))
+            for found in (tracks, others, no_parts(others, self.labels, self.criterion))
         )
         numbers = [each.numbers for each in score.targets.values() if each.numbers]
         delays_s = [each.first_track_s for each in score.targets.values() if each.first_track_s is not None]
@@ -235,26 +233,18 @@ def off_boxes(tracks: Iterable[Tracked], boxes: Mapping[int, Sequence[Box]], cri
     return kept
 
 
-def no_parts(tracks: Iterable[Tracked], labels: Mapping[int, Sequence[Label]]) -> list[Tracked]:
-    """Leave out what is mostly inside a label: parts of its target."""
-    return [each for each in tracks if not (compare(labels.get(each.frame, ()), [each]).of_track > INSIDE).any()]
+def no_parts(tracks: Iterable[Tracked], labels: Mapping[int, Sequence[Label]], criterion: Criterion) -> list[Tracked]:
+    """Leave out what is mostly inside a label and yet not on it: parts of its target."""
+
+    def is_part(track: Tracked) -> bool:
+        boxes = labels.get(track.frame, ())
+        inside, similar = compare(boxes, [track]).of_track > INSIDE, criterion.similarity(boxes, [track])
+        return bool((inside & (similar < criterion.iou)).any())
+
+    return [each for each in tracks if not is_part(each)]
 
 
 # Altered films
-
-
-def altered(film: LabelledFilm, way: str) -> LabelledFilm:
-    """Alter a film in a way of the settings."""
-    alter: Mapping[str, Callable[[LabelledFilm], LabelledFilm]] = {
-        "no": lambda film: film,
-        "half": lambda film: scaled(film, 1 / 2),
-        "a third": lambda film: scaled(film, 1 / 3),
-        "twice": lambda film: scaled(film, 2),
-        "shaken": shaken,
-        "dropped": dropped,
-        "compressed": compressed,
-    }
-    return alter[way](film)
 
 
 def scaled(film: LabelledFilm, times: float) -> LabelledFilm:
@@ -311,12 +301,23 @@ def _with(frame: Frame, image: Any) -> Frame:
     return replace(frame, image=picture)
 
 
+ALTERATIONS: Mapping[str, Callable[[LabelledFilm], LabelledFilm]] = {
+    "no": lambda film: film,
+    "half": lambda film: scaled(film, 1 / 2),
+    "a third": lambda film: scaled(film, 1 / 3),
+    "twice": lambda film: scaled(film, 2),
+    "shaken": shaken,
+    "dropped": dropped,
+    "compressed": compressed,
+}
+
+
 # Ways
 
 
 def one(settings: FilmsSettings, number: int) -> list[Row]:
     """Search a film in every way; give a row for each setting, and the detector's usual one by published labels too."""
-    film = altered(film_to_score(films_of_half(settings)[number]), settings.altered)
+    film = ALTERATIONS[settings.altered](film_to_score(films_of_half(settings)[number]))
     target = replace(film.target, detector=settings.detector)
     usual = tracking_settings(target).confirm_score
     found = tracks_of(make_detector(target, film.rate_hz), target, sorted({usual, *settings.scores}), film.frames)
@@ -327,12 +328,12 @@ def one(settings: FilmsSettings, number: int) -> list[Row]:
         for area, tracks in foreground_tracks(subtract, settings.areas_px, film.frames, film.target).items():
             ways[way, threshold, area] = tracks
     usuals = [(settings.detector, usual, 0), *((way, THRESHOLD, AREA_PX) for way in others[settings.beside])]
-    labels = "redrawn" if film.published else "all"
-    rows = [film.row(*way, tracks) | {"usual": way in usuals, "labels": labels} for way, tracks in ways.items()]
+    more = {"seed": number, "labels": "redrawn" if film.published else "all"}
+    rows = [film.row(*way, tracks) | more | {"usual": way in usuals} for way, tracks in ways.items()]
     if film.published:
         row = replace(film, labels=film.published).row(*usuals[0], found[usual])
-        rows.append(row | {"usual": True, "labels": "published"})
-    return [{"seed": number, **row} for row in rows]
+        rows.append(row | more | {"usual": True, "labels": "published"})
+    return rows
 
 
 def detector_tracks(
@@ -375,6 +376,7 @@ def subtractor(way: str, threshold: float) -> Callable[[Image], Image]:
     """
     if way == "SuBSENSE":
         return _subsense(30 * threshold / THRESHOLD)
+    cv2.setRNGSeed(0)  # KNN draws at random
     model = MIXTURES[way](500, threshold if way == "MOG2" else 25 * threshold, False)
     return lambda image: np.asarray(model.apply(image), dtype=np.uint8)
 
@@ -437,8 +439,9 @@ def _confirmed(tracker: Tracker, index: int, frame: Frame) -> list[Tracked]:
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """Give the figures of each way over all flyers, by labels as redrawn, and those of the detector in each film."""
     ours, flyers = rows[0]["way"], [row for row in rows if row["film"] not in OTHERS]
+    ways = grouped([row for row in flyers if row["labels"] != "published"], "way")
     found: dict[str, dict[str, Any]] = {}
-    for way, mine in grouped([row for row in flyers if row["labels"] != "published"], "way").items():
+    for way, mine in ways.items():
         found[way] = figures([row for row in mine if row["usual"]]) | recall_at(curve(mine))
     usual = [row for row in rows if row["way"] == ours and row["usual"]]
     found[f"{ours}, as published"] = figures([r for r in usual if r in flyers and r["labels"] != "redrawn"])
@@ -507,13 +510,9 @@ def _median(values: Iterable[float | None]) -> float | None:
 
 def curve(rows: Sequence[Row]) -> list[tuple[float, float]]:
     """Give false tracks a minute, without those on flyers that have no label, and recall, for each setting of a way."""
-    found = []
-    for mine in grouped(rows, "threshold", "smallest_px").values():
-        boxes, hit, false, minutes = (
-            sum(row[name] for row in mine) for name in ("boxes", "found", "no_flyer", "minutes")
-        )
-        found.append((false / minutes, hit / boxes))
-    return sorted(found)
+    names, settings = ("boxes", "found", "no_flyer", "minutes"), grouped(rows, "threshold", "smallest_px")
+    sums = [[sum(row[name] for row in mine) for name in names] for mine in settings.values()]
+    return sorted((false / minutes, hit / boxes) for boxes, hit, false, minutes in sums)
 
 
 def recall_at(points: Sequence[tuple[float, float]]) -> dict[str, float]:

@@ -9,13 +9,13 @@ from cotarget.track_metrics import Box, Criterion, Label, Tracked, read_labels
 from cotarget.video import FilmWriter
 from experiments.following import films, own_shapes, score_folds
 from experiments.following.films import (
+    ALTERATIONS,
     DIVISION,
     LABELS,
     OTHERS,
     SIZE_NAMES,
     FilmsSettings,
     LabelledFilm,
-    altered,
     dropped,
     film_to_score,
     films_of_half,
@@ -138,11 +138,14 @@ def test_what_lies_on_a_box_that_must_not_count_is_left_out():
 
 
 def test_parts_of_a_target_are_told_from_other_false_tracks():
-    """A square of 40 px with a track on its corner, one half inside, and one beside it."""
+    """A square of 40 px with a track on its corner, one half inside, one beside it, and one on it."""
     label = Label(np.array([50.0, 50.0]), np.array([40.0, 40.0]))
-    part, half, beside = (Tracked(np.array([u, 60.0]), np.array([10.0, 10.0]), 3, 0.1, 1) for u in (64.0, 70.0, 80.0))
-    assert no_parts([part, half, beside], {3: [label]}) == [half, beside]
-    assert no_parts([part], {4: [label]}) == [part]
+    part, half, beside, on = (
+        Tracked(np.array([u, 60.0]), np.array([side, side]), 3, 0.1, 1)
+        for u, side in ((64.0, 10.0), (70.0, 10.0), (80.0, 10.0), (50.0, 36.0))
+    )
+    assert no_parts([part, half, beside, on], {3: [label]}, Criterion()) == [half, beside, on]
+    assert no_parts([part], {4: [label]}, Criterion()) == [part]
 
 
 def dark(frame):
@@ -154,7 +157,7 @@ def dark(frame):
 
 @pytest.mark.parametrize("way", ["half", "twice", "shaken", "dropped", "compressed"])
 def test_labels_stay_on_their_target(way):
-    made = altered(film(), way)
+    made = ALTERATIONS[way](film())
     for i, frame in enumerate(made.frames):
         for boxes in (made.labels, made.flyers):
             assert boxes[i][0].center_px == pytest.approx(dark(frame), abs=0.15)
