@@ -108,8 +108,7 @@ class SimCamera:
         noise: standard deviation of the sensor's noise [grey levels].
         rate_hz: frames per second.
         latency_s: time from light to frame [s].
-        exposure_s: exposure time, during which motion blurs the image; rendering takes twice as long while the camera
-            turns; 0 for an instant [s].
+        exposure_s: exposure time, during which motion blurs the image; 0 for an instant [s].
         jpeg_quality: JPEG quality.
     """
 

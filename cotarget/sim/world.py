@@ -125,7 +125,7 @@ class SimWorld:
 
     def render(self, camera: str, lens: TrueLens, t: float) -> Image:
         """Render the image of a lens at time t [s] without sensor effects, BGR."""
-        return self._views().sharp(camera, lens, t)
+        return self._views().exposed(camera, lambda _: lens, t, exposure=0.0)
 
     def pictures(self, size: tuple[int, int], before: SizedPictures | None = None) -> SizedPictures:
         """Open a renderer of both cameras at another size; the caller closes it.
@@ -149,7 +149,7 @@ class SimWorld:
     def close(self) -> None:
         """Release the renderers and the rig's access to the world; safe to call more than once."""
         if self._opened is not None:
-            self._opened.close()
+            self._opened.canvas.close()
         # Breaks reference cycles that would keep the model's memory until a garbage collection.
         for device in self._of_world:
             device.leave()
@@ -158,10 +158,7 @@ class SimWorld:
     def _views(self) -> Views:
         """Give the renderer of both cameras, opened on first use."""
         if self._opened is None:
-            effects = self.config.sim.effects
-            self._opened = Views(
-                self._model, self._state, self._render_size, effects.shadows, multisampling=effects.multisampling
-            )
+            self._opened = Views(self._model, self._state, self._render_size, self.config.sim.effects.shadows)
         return self._opened
 
     def _camera(self, name: CameraName) -> SimCamera:

@@ -94,6 +94,7 @@ class Canvas:
 
     Attributes:
         drawn: number of pictures that all canvases of this process have drawn; a part of a picture counts as that part.
+        samples: number of samples a pixel; 0 without multisampling.
     """
 
     drawn: ClassVar[float] = 0.0
@@ -109,13 +110,16 @@ class Canvas:
         Raises:
             DeviceError: the machine has no suitable OpenGL.
         """
-        self._model, self._size, self._shadows, self._uploaded_parts = model, size, shadows, _uploaded_parts(model)
+        self._model, self._uploaded_parts = model, _uploaded_parts(model)
         self._renderer: Any = make_renderer(model, *size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
-        self._option, self._untouched = mujoco.MjvOption(), mujoco.MjvPerturb()
-        self._option.sitegroup[:] = 0
+        self._option = mujoco.MjvOption()
+        self._option.sitegroup[:], self._option.geomgroup[1:] = 0, 0
         context = self._renderer._mjr_context
-        self._samples, self._buffer_size = context.offSamples, (context.offWidth, context.offHeight)
+        self.samples = context.offSamples
+        # MuJoCo resolves samples into a second buffer, which has one sample a pixel.
+        self._buffers = {True: context.offFBO, False: context.offFBO_r if self.samples else context.offFBO}
+        self._pixels = np.empty(3 * context.offWidth * context.offHeight, dtype=np.uint8)
 
     def turn_to(self, model: "mujoco.MjModel") -> bool:
         """Draw another model from now on, if it differs from the current one in mesh vertices at most.
@@ -135,20 +139,9 @@ class Canvas:
             mujoco.mjr_uploadMesh(model, renderer._mjr_context, mesh)
         return True
 
-    def look(self, data: "mujoco.MjData", camera_id: int, layers: int) -> None:
-        """Load the scene from a camera of the model.
-
-        Args:
-            data: data with the current poses.
-            camera_id: MuJoCo id of the camera.
-            layers: number of geom groups to draw, one after the other from group 0.
-        """
-        self._option.geomgroup[:] = np.arange(mujoco.mjNGROUP) == 0
+    def look(self, data: "mujoco.MjData", camera_id: int) -> None:
+        """Load the geoms of group 0 in their current poses, from the camera of the model with this id."""
         self._renderer.update_scene(data, camera_id, self._option)
-        for layer in range(1, layers):
-            self._option.geomgroup[:] = np.arange(mujoco.mjNGROUP) == layer
-            everything = mujoco.mjtCatBit.mjCAT_ALL.value
-            mujoco.mjv_addGeoms(self._model, data, self._option, self._untouched, everything, self._renderer.scene)
 
     def draw(
         self,
@@ -159,7 +152,7 @@ class Canvas:
         part: float = 1.0,
         multisampled: bool = True,
     ) -> Image:
-        """Draw the scene, RGB.
+        """Draw the scene, RGB; the next call overwrites the picture.
 
         Args:
             eye: optical centre in the world [m], (3,).
@@ -176,12 +169,14 @@ class Canvas:
             camera.frustum_center, camera.frustum_width = near * (left + right) / 2, near * (right - left) / 2
             camera.frustum_bottom, camera.frustum_top = near * bottom, near * top
         rect = mujoco.MjrRect(0, 0, *size)
-        image = np.empty((size[1], size[0], 3), dtype=np.uint8)
+        image = self._pixels[: 3 * size[0] * size[1]].reshape(size[1], size[0], 3)
         # mujoco.Renderer draws whole pictures of its own size only.
         self._make_current()
-        self._set_samples(self._samples if multisampled else 0)
-        mujoco.mjr_render(rect, renderer.scene, renderer._mjr_context)
-        mujoco.mjr_readPixels(image, None, rect, renderer._mjr_context)
+        context = renderer._mjr_context
+        context.offFBO, context.offSamples = self._buffers[multisampled], self.samples * multisampled
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
+        mujoco.mjr_render(rect, renderer.scene, context)
+        mujoco.mjr_readPixels(image, None, rect, context)
         before = int(Canvas.drawn)
         Canvas.drawn += part
         if (tally := os.environ.get(TALLY)) and (more := int(Canvas.drawn) - before):
@@ -196,18 +191,6 @@ class Canvas:
     def _make_current(self) -> None:
         if self._renderer._gl_context:
             self._renderer._gl_context.make_current()
-
-    def _set_samples(self, samples: int) -> None:
-        """Remake the offscreen buffer with another number of samples a pixel.
-
-        It takes a millisecond. A second context for this would hold all textures once more, some 90 MB.
-        """
-        context = self._renderer._mjr_context
-        if context.offSamples != samples:
-            context.offSamples = samples
-            width, height = self._buffer_size
-            # MuJoCo makes a new buffer only for another size.
-            mujoco.mjr_resizeOffscreen(width if context.offWidth != width else width + 1, height, context)
 
 
 def _uploaded_parts(model: "mujoco.MjModel") -> tuple[object, ...]:

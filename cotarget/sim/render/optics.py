@@ -18,16 +18,15 @@ from cotarget.rig import Image
 # px, depending on its phase between two pixels of the render. With equal fineness that phase is the same all around the
 # axis, and a fit takes it for distortion. With 1.03, all phases occur within 33 px. Measurements: docs/design-notes.md.
 FINENESS = 1.03
+# Margin on each side of a render, relative to its width: what half an exposure brings into view while a camera turns.
+TURN_MARGIN = 0.025
 # The map is computed at every fourth pixel and interpolated: a distortion of k1 = -0.2 curves by less than
-# 6 |k1| r / f a pixel, so that this costs at most 0.005 px, in the corners.
+# 6 |k1| r / f a pixel, so that this costs at most 0.005 px, and 0.02 px in the outermost pixels of the corners.
 MAP_STRIDE = 4
 REAL_ROOT = 1e-9  # largest imaginary part over absolute value of a root that is real up to rounding
-# Cache sizes. Maps are cached for the lens positions in use: the fixed camera's and the zoom camera's latest.
-KEPT_MAPS = 8
+KEPT_MAPS = 8  # of the lens positions in use: the fixed camera's and the zoom camera's latest
 KEPT_FIELDS = 128  # fields of view are a few numbers each; a rig that is rebuilt often asks for all its focal lengths
-# Fixed-point iteration: each round shrinks the error by about 3 |k1| r^2, less than 0.3 for usual lenses.
-UNDISTORT_ROUNDS = 60
-DIVERGED = 10.0  # times the smallest step: plain steps grow for lenses that stretch by two and more
+UNDISTORT_ROUNDS = 60  # Newton's steps at most; five are usual
 UNDISTORTED = 1e-14  # step of the normalised coordinates at convergence
 
 
@@ -60,22 +59,8 @@ class TrueLens:
         return np.where(seen[..., None], self.bend(xy) * self.focal_px + self.center_px, np.nan)
 
     def directions(self, pixels: Array) -> Array:
-        """Undistort pixels (..., 2) to image-plane coordinates (x / z, y / z), (..., 2)."""
+        """Undistort pixels (..., 2) to image-plane coordinates (x / z, y / z), (..., 2), by Newton's method."""
         bent = (pixels - self.center_px) / self.focal_px
-        xy, most = bent, math.inf
-        for _ in range(UNDISTORT_ROUNDS):
-            step = bent - self.bend(xy)
-            size = np.abs(step).max()
-            if size > most:
-                break
-            most = min(most, DIVERGED * size)
-            xy = xy + step
-            if size < UNDISTORTED:
-                return xy
-        return self._by_newton(bent)
-
-    def _by_newton(self, bent: Array) -> Array:
-        """Undistort image-plane coordinates (..., 2) by Newton's method, for lenses whose plain steps diverge."""
         k1, k2, p1, p2, k3 = self.distortion
         xy = bent
         for _ in range(UNDISTORT_ROUNDS):
@@ -86,10 +71,11 @@ class TrueLens:
             down = gain + 2 * y**2 * rise + 6 * p1 * y + 2 * p2 * x
             mixed = 2 * x * y * rise + 2 * p1 * x + 2 * p2 * y
             off = bent - self.bend(xy)
-            step = np.stack(
-                [down * off[..., 0] - mixed * off[..., 1], across * off[..., 1] - mixed * off[..., 0]], axis=-1
+            u, v = off[..., 0], off[..., 1]
+            step = (
+                np.stack([down * u - mixed * v, across * v - mixed * u], axis=-1)
+                / (across * down - mixed**2)[..., None]
             )
-            step /= (across * down - mixed**2)[..., None]
             xy = xy + step
             if np.abs(step).max() < UNDISTORTED:
                 break
@@ -132,10 +118,11 @@ def covering_half_field(lens: TrueLens) -> tuple[float, float]:
 
 
 def covering_size(lenses: Sequence[TrueLens], least: tuple[int, int]) -> tuple[int, int]:
-    """Give a size (width, height) [px] for the covering views of all these lenses, somewhat above the least size."""
+    """Give a size (width, height) [px] for the covering views of all these lenses, with a margin to turn."""
     bent = [_fine_size(lens) for lens in lenses if any(lens.distortion)]
     width, height = np.max([(least[0] + 3, least[1] + 3), *bent], axis=0).tolist()
-    return width, height
+    margin = math.ceil(TURN_MARGIN * width)
+    return width + 2 * margin, height + 2 * margin
 
 
 def _fine_size(lens: TrueLens) -> tuple[int, int]:
@@ -162,25 +149,30 @@ def covering_view(lens: TrueLens, largest: tuple[int, int]) -> Pinhole:
     return Pinhole((width, height), (focal, focal), ((width - 1) / 2, (height - 1) / 2))
 
 
-def bend(render: Image, view: Pinhole, lens: TrueLens) -> Image:
-    """Resample a pinhole render into the lens's image.
+def bend(render: Image, view: Pinhole, lens: TrueLens, homography: Array | None = None) -> Image:
+    """Resample a render into the lens's image.
 
     Args:
-        render: image of the view.
+        render: image of the view, or of another that ``homography`` leads to; four channels are by far the fastest.
         view: pinhole view that covers everything in the lens's image.
         lens: lens whose image is made.
+        homography: maps the view's pixels to the render's, (3, 3); the identity by default.
     """
-    return cv2.remap(render, _map(lens, view), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if homography is None and view == Pinhole(lens.size, lens.focal_px, lens.center_px):
+        return render
+    w, h = lens.size
+    coarse = _map(lens, view) if homography is None else cv2.perspectiveTransform(_map(lens, view), homography)
+    places = cv2.resize(coarse, None, fx=MAP_STRIDE, fy=MAP_STRIDE, interpolation=cv2.INTER_LINEAR)
+    places = places[MAP_STRIDE : MAP_STRIDE + h, MAP_STRIDE : MAP_STRIDE + w]
+    return np.asarray(cv2.remap(render, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 @lru_cache(maxsize=KEPT_MAPS)
 def _map(lens: TrueLens, view: Pinhole) -> Array:
-    """Map each pixel of the lens's image to its position in the pinhole render, (H, W, 2) float32."""
-    w, h = lens.size
-    u, v = np.arange(0, w + MAP_STRIDE, MAP_STRIDE), np.arange(0, h + MAP_STRIDE, MAP_STRIDE)
-    coarse = lens.directions(np.stack(np.meshgrid(u, v), axis=-1).astype(float)) * view.focal_px
-    coarse += view.center_px
-    # Interpolate exactly at multiples of the stride: an affine warp, because a resize shifts by half a sample.
-    scale = np.array([[1 / MAP_STRIDE, 0, 0], [0, 1 / MAP_STRIDE, 0]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(coarse.astype(np.float32), scale, (w, h), flags=flags)
+    """Give the view's pixel of the middle of each square of `MAP_STRIDE` image pixels, from one before the image on.
+
+    Those beyond the image are extrapolated, because a lens may fold back there.
+    """
+    u, v = (np.arange((MAP_STRIDE - 1) / 2, n, MAP_STRIDE) for n in lens.size)
+    inner = lens.directions(np.stack(np.meshgrid(u, v), axis=-1)) * view.focal_px + view.center_px
+    return np.pad(inner, ((1, 2), (1, 2), (0, 0)), "reflect", reflect_type="odd").astype(np.float32)

@@ -56,7 +56,7 @@ class SizedPictures:
         largest = covering_size([_resized(lens, size) for lens in lenses], size)
         model.vis.global_.offwidth, model.vis.global_.offheight = largest
         canvas = None if before is None else before.hand_over(model)
-        self._views = Views(model, state, largest, sim.effects.shadows, sim.effects.multisampling, canvas, soft=False)
+        self._views = Views(model, state, largest, sim.effects.shadows, canvas, soft=False)
         self._sensors = {
             name: Sensor(replace(camera, size=size), sim.effects, (sim.seed, NOISE[name]))
             for name, camera in self._cameras.items()
@@ -78,7 +78,7 @@ class SizedPictures:
 
     def close(self) -> None:
         """Release OpenGL; safe to call more than once."""
-        self._views.close()
+        self._views.canvas.close()
 
 
 def _resized(lens: TrueLens, size: tuple[int, int]) -> TrueLens:
