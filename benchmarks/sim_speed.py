@@ -6,7 +6,8 @@ medians over the steps.
 
 1. Image effects off: a step, and mujoco.Renderer drawing the same two frames of the same world, with the same size,
    antialiasing, focal length and pose, the poses being prepared.
-2. Each image effect alone, and all of them, against none. Blur is that of 1/100 s under a turning head.
+2. Each image effect alone, and all of them, against none. Blur is that of 1/100 s under a turning head. The same with
+   all of them at 1920x1080, with the processor's time of all threads.
 3. Seconds of simulated time per second of the whole pipeline following a bird, as in `experiments.following.hold`: both
    cameras rendered with all effects; and nothing rendered, with detections from ground truth. For the latter, the time
    of the simulation alone is given too.
@@ -40,6 +41,7 @@ TURN, TURN_S = 0.15, 1.5  # amplitude [rad] and period [s] of the head's swing
 ZOOMED = 3.0  # factor on the shortest focal length
 SETTLED_S = 1.0  # time before anything is timed; the lens has arrived then
 RENDERER, LOOP, ALL = "mujoco.Renderer", "loop", "all of them"
+SIZES = ((640, 480), (1920, 1080))
 # Goals: least and largest value.
 WANTED: Mapping[str, tuple[float, float]] = {
     "loop_over_renderer": (0.0, 1.15),
@@ -61,7 +63,7 @@ class SimSpeedSettings(FieldSettings):
 
 def one(settings: SimSpeedSettings, seed: int) -> list[Row]:
     """Time all cases once; give a row per step."""
-    rows = _beside_renderer(settings, seed) + _beside_none(settings, seed)
+    rows = _beside_renderer(settings, seed) + _beside_none(settings, seed) + _sized(settings, seed)
     for what, steps in (
         ("rendered", held(calibrated(settings), settings.seconds_rendered, seed)),
         ("unrendered", held_unrendered(calibrated(settings), settings.seconds, seed)),
@@ -71,11 +73,14 @@ def one(settings: SimSpeedSettings, seed: int) -> list[Row]:
     return rows
 
 
-def config_with(seed: int, on: Sequence[str]) -> RigConfig:
+def config_with(seed: int, on: Sequence[str], size: tuple[int, int] = SIZES[0]) -> RigConfig:
     """Configure the bird to follow with these image effects only; other effects are unchanged."""
     config = hold_config(TARGET, seed)
     effects = replace(config.sim.effects, **{name: name in on for name in IMAGE_EFFECTS})
-    return replace(config, sim=replace(config.sim, effects=effects))
+    fixed, zoom = config.sim.fixed, config.sim.zoom
+    fixed = replace(fixed, size=size, **fixed.fitted(size, None))
+    zoom = replace(zoom, size=size, **zoom.fitted(size, None))
+    return replace(config, sim=replace(config.sim, effects=effects, fixed=fixed, zoom=zoom))
 
 
 class Stepper:
@@ -134,6 +139,21 @@ def _beside_none(settings: SimSpeedSettings, seed: int) -> list[Row]:
                 row = {"seed": seed, "what": what, "step": i, "ms": 1e3 * stepper.step(), "without_ms": 1e3 * bare}
                 rows[what] += [row] if i else []
     return [row for mine in rows.values() for row in mine]
+
+
+def _sized(settings: SimSpeedSettings, seed: int) -> list[Row]:
+    """Time steps with all image effects at each size, in real time and in the processor's."""
+    rows = []
+    for size in SIZES:
+        stepper = Stepper(config_with(seed, IMAGE_EFFECTS, size))
+        with stepper.world.rig:
+            stepper.step()  # the first step fills caches
+            for i in range(settings.steps):
+                began = time.process_time()
+                ms = 1e3 * stepper.step()
+                cpu_ms = 1e3 * (time.process_time() - began)
+                rows.append({"seed": seed, "what": f"{size[0]}x{size[1]}", "step": i, "ms": ms, "cpu_ms": cpu_ms})
+    return rows
 
 
 def held(calibration: Calibration, seconds: float, seed: int) -> Iterator[tuple[Step, Truth]]:
@@ -195,11 +215,17 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         }
         for name in (*IMAGE_EFFECTS, ALL)
     }
+    sizes = {
+        what: {"ms": float(np.median(of(what))), "cpu_ms": float(np.median(of(what, "cpu_ms")))}
+        for what in (f"{w}x{h}" for w, h in SIZES)
+        if len(of(what))  # rows of 0.1.0 have none
+    }
     return {
         "loop_ms": float(np.median(of(LOOP))),
         "renderer_ms": float(np.median(of(RENDERER))),
         "loop_over_renderer": float(np.median(of(LOOP) / of(RENDERER))),
         "effects": shares,
+        **({"sizes": sizes} if sizes else {}),
         "real_time_rendered": float(np.median(of("rendered", "factor"))),
         "real_time_unrendered": float(np.median(of("unrendered", "factor"))),
         "simulation_alone_ms": float(np.median(of("simulation alone"))),
@@ -214,4 +240,4 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 SETTINGS = SimSpeedSettings()
 QUICK = replace(SETTINGS, seeds=1, steps=3, seconds_rendered=0.4, seconds=2.0, calibrated=False)
 ALONE = True
-COST_S = 120.0
+COST_S = 160.0
