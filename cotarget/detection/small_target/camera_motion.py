@@ -25,6 +25,9 @@ MANY = 24
 # If less than the first part of the corners is found again, or less than the second part of these at one shift, the
 # film was cut or the camera was moved. Standing corners count as the scene's from the second part on.
 FOUND_AGAIN, FEWEST_ALIKE = 0.3, 0.35
+# Fewest corners that stand and look the same, by this mean difference [grey levels], where the film goes on: a large
+# target before plain ground has the others. After a cut none do, but those of writing.
+FEWEST_STANDING, SAME_PLACE = 5, 12.0
 # Frames after which corners are detected again, because some have drifted off and some are on a target.
 RENEW_FRAMES = 15
 # Window in which a corner is tracked, and pyramid levels: up to 20 px a frame of the full image.
@@ -85,7 +88,7 @@ class CameraMotion:
             self.jumped = len(self._corners) < FEWEST and len(come) >= MANY and _spread(come, after) >= SPREAD
             self._begin(come)
             return
-        ahead, found, _ = cv2.calcOpticalFlowPyrLK(
+        ahead, found, error = cv2.calcOpticalFlowPyrLK(
             before, after, self._corners, None, winSize=WINDOW_PX, maxLevel=LEVELS
         )
         kept = found.ravel() > 0
@@ -99,7 +102,8 @@ class CameraMotion:
         if farther and standing.sum() >= fewest:
             alike = standing
         if kept.mean() < FOUND_AGAIN or alike.sum() < fewest:
-            self.jumped, self._age = True, RENEW_FRAMES
+            as_before = kept & _alike(flow, np.zeros(2)) & (error.ravel() < SAME_PLACE)
+            self.jumped, self._age = as_before.sum() < FEWEST_STANDING, RENEW_FRAMES
             return
         way = (ahead - self._first).reshape(-1, 2)[alike]
         self._corners, self._first = ahead[kept], self._first[kept]
