@@ -113,7 +113,7 @@ class AutoDetector:
         if shift_px is not None:
             self._background = self._large.subtract(frame, self._held, shift_px)
             large = [replace(each, score=LARGE_SCORE) for each in self._background.boxes]
-            outlined = [target.beside <= PLAIN for target in targets]
+            outlined = [target.whole or target.beside <= PLAIN for target in targets]
             large = [each for each in large if each.size_px.max() >= LARGE_PART * width]
             found = fuse(small, outlined, self._are_followed(small, frame.t, width), large)
             self._apart = [each for each in found if any(each is one for one in small)]
@@ -242,6 +242,9 @@ def fuse(
         same = [(each, plain) for each, plain in zip(small, outlined, strict=True) if _covered(whole, each) > SAME]
         if any(plain or _covered(each, whole) < MOST for each, plain in same):
             continue
+        inside = [each for each, plain in zip(small, outlined, strict=True) if plain and _covered(each, whole) > INSIDE]
+        if any(AREA_RATIO * each.size_px.prod() > whole.size_px.prod() for each in inside):
+            continue  # the rest of it is the place that the target has left
         parts = [
             each
             for each, own in zip(small, followed, strict=True)

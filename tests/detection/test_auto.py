@@ -61,6 +61,40 @@ def moved(background, surface, places):
         yield picture
 
 
+def test_an_aeroplane_before_the_sky_is_one_target_as_a_whole():
+    """It moves by a 160th of its length a frame; parts of it are as bright as the sky."""
+    rng = np.random.default_rng(4)
+    sky = np.broadcast_to(np.linspace(190, 160, 480)[:, None, None], (480, 640, 3)).astype(np.float32)
+    pictures = []
+    for i in range(75):
+        picture, x = sky.copy(), 120 + 1.5 * i
+        corners = np.array(
+            [
+                [0, 0],
+                [95, -10],
+                [120, -100],
+                [140, -100],
+                [130, -12],
+                [215, -12],
+                [232, -40],
+                [245, -40],
+                [240, 12],
+                [130, 12],
+                [150, 90],
+                [130, 90],
+                [95, 10],
+            ]
+        )  # nose, wings, fin
+        cv2.fillPoly(picture, [np.int32(np.rint(np.add(corners, (x, 210)) * 16))], [130.0] * 3, cv2.LINE_AA, 4)
+        cv2.rectangle(picture, (round(x) + 60, 202), (round(x) + 200, 206), [185.0] * 3, cv2.FILLED)
+        pictures.append(cv2.GaussianBlur(picture, (0, 0), 1.0))
+    for i, tracks in enumerate(follow(pictures, 25.0, rng)):
+        if i >= 25:
+            (track,) = tracks
+            assert track.center_px == pytest.approx([242 + 1.5 * i, 205], abs=10)
+            assert track.size_px == pytest.approx([245, 190], abs=15)
+
+
 def test_a_person_who_stands_is_held_for_a_minute():
     """He walks in for 4 s, stands for a minute, and is one track; the background alone would have learnt him."""
     rng, rate = np.random.default_rng(1), 5.0

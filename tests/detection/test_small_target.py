@@ -96,9 +96,10 @@ def test_small_targets_of_all_sizes_are_found_where_they_are(size):
     found = watch(film(40, paint))
     for i, boxes in list(enumerate(found))[15:]:
         (box,) = [box for box in boxes if box.score > 0.5]
-        # The outline at a third of the contrast lies half a pixel outside the true one on each side, at most one.
+        # The outline at a third of the contrast lies half a pixel outside the true one on each side, at most one; that
+        # of a whole before a plain background lies on a grid of one pixel, or two in images that are not enlarged.
         np.testing.assert_allclose(box.center_px, (40.3 + speed * i, 80.6), atol=1.0)
-        assert -0.1 * size - 1 <= box.size_px[0] - size <= 2.5
+        assert -0.1 * size - 1 <= box.size_px[0] - size <= 3.0
 
 
 def test_a_bird_of_one_pixel_before_a_plain_sky_is_found():
@@ -328,6 +329,24 @@ def test_a_cut_is_noticed_and_a_sky_without_corners_stands():
         picture = photograph(landscape(np.random.default_rng(6)), rng)
         camera.update(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
         assert camera.jumped == jumped
+
+
+def test_a_large_thing_that_passes_before_plain_ground_is_no_cut():
+    """As a near car does, whose front and roof move unlike: it has most of the corners, and asphalt some stones."""
+    rng = np.random.default_rng(3)
+    ground = np.full((HEIGHT, WIDTH, 3), 110.0)
+    for u, v in rng.uniform((4, 4), (WIDTH - 4, HEIGHT - 4), (60, 2)):
+        draw(ground, u, v, 5, 5, grey=40.0)
+    near, far = (60 * cv2.GaussianBlur(rng.normal(0, 1, (90, 150, 3)), (0, 0), 2.0) for _ in range(2))
+    camera = CameraMotion()
+    for i in range(40):
+        picture = ground.copy()
+        for part, top, left in ((near, 120, 8 * i - 150), (far, 30, 4 * i - 100)):
+            a, b = max(0, left), min(WIDTH, left + 150)
+            picture[top : top + 90, a:b] = 120 + 4 * part[:, a - left : b - left]
+        shift = camera.update(cv2.cvtColor(photograph(np.clip(picture, 0, 255), rng), cv2.COLOR_BGR2GRAY))
+        assert not camera.jumped
+        assert np.abs(shift).max() < 1.0
 
 
 def test_a_bird_alone_in_the_sky_is_not_taken_for_the_cameras_motion():

@@ -3,6 +3,7 @@
 This is a constant false alarm rate detector (Rohling 1983) in two dimensions.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -31,16 +32,10 @@ SMALLEST_TIMES = 2.0
 BESIDE, BESIDE_PX = 2.0, 6.0
 # Part of the contrast at which a target's outline lies.
 OUTLINE = 0.33
-# From this scale on, wings and rotors that are fainter than the body belong to the target: what stands out by this
-# many standard deviations of the surroundings, brighter or darker, and by a least part of the contrast.
-LARGE_SCALE, FAINT, FAINTEST = 2, 3.0, 0.05
-# Window of the mean that a pixel is compared with for its texture [px]. Bright and dark parts of an aeroplane cancel in
-# the mean of a coarse scale; in the sky around it there is no texture.
-TEXTURE_PX = (5, 5)
+# Scale at which texture is measured, and the window of the mean that a pixel is compared with for it [px].
+TEXTURE_SCALE, TEXTURE_PX = 2, (5, 5)
 # Outlines are found this many scales finer than the peak, which bounds the window's size.
 WINDOW_SCALES = 3
-# The lens' blur is as faint: it reaches this far around the body [px].
-BLUR_PX = 2.5
 
 
 @dataclass(frozen=True)
@@ -55,6 +50,7 @@ class SmallTarget:
         around: mean grey level of the surroundings.
         beside: largest texture beside it [grey levels]: little in the sky, much at a mast or a twig; inf if unknown.
         since: its change since each of `AGES_S`, nan if unknown; () if it was not compared.
+        whole: whether it is a whole before a plain background, and what is inside it is no target of its own.
     """
 
     low: tuple[int, int]
@@ -64,6 +60,7 @@ class SmallTarget:
     around: float
     beside: float = 0.0
     since: tuple[float, ...] = ()
+    whole: bool = False
 
 
 def find_small_targets(
@@ -96,26 +93,22 @@ def find_small_targets(
         above = levels[scale - 1] if scale == first and first else None
         sloping, finest = scale - first >= SLOPING_SCALE, scale == 0 and not of_difference
         peaks += _peaks(level, levels[-1], scale, sloping, threshold, most, above, finest)
-        if scale - first > LARGE_SCALE and texture is not None:
-            texture = cv2.resize(texture, level.shape[::-1], interpolation=cv2.INTER_AREA)
-            peaks += _textured(texture, levels[-1], scale, threshold, most)
-        elif scale - first == LARGE_SCALE and not of_difference:
-            texture = fine_texture = cv2.absdiff(level, cv2.blur(level, TEXTURE_PX))
+        if scale - first == TEXTURE_SCALE and not of_difference:
+            texture = cv2.absdiff(level, cv2.blur(level, TEXTURE_PX))
     peaks.sort(key=lambda peak: -peak.signal)
     kept: list[SmallTarget] = []
     for peak in peaks:
         at = (peak.u + 0.5) * 2**peak.scale, (peak.v + 0.5) * 2**peak.scale
         if any(_contains(target, at) for target in kept):
             continue
-        large = peak.scale - first >= LARGE_SCALE
-        target = _outline(levels, peak, large, of_difference)
+        target = _outline(levels, peak, of_difference)
         if target is not None and not any(share(target, other) for other in kept):
             kept.append(target)
             if len(kept) == most:
                 break
     if texture is None:
         return kept
-    return [replace(target, beside=_beside(fine_texture, target, 2 ** (first + LARGE_SCALE))) for target in kept]
+    return [replace(target, beside=_beside(texture, target, 2 ** (first + TEXTURE_SCALE))) for target in kept]
 
 
 def _contains(target: SmallTarget, at: tuple[float, float]) -> bool:
@@ -216,17 +209,6 @@ def _peaks(
     return peaks[:most]
 
 
-def _textured(texture: Image, half: Image, scale: int, threshold: float, most: int) -> list[_Peak]:
-    """Find peaks of texture, as `_peaks` does, with the mean of the ring in the image of half the size."""
-    coarse = cv2.resize(texture, half.shape[::-1], interpolation=cv2.INTER_AREA)
-    peaks = _peaks(texture, coarse, scale, False, threshold, most)
-    if not peaks:
-        return []
-    mean, _ = _ring(half, False)
-    height, width = mean.shape
-    return [replace(p, around=float(mean[min(p.v // 2, height - 1), min(p.u // 2, width - 1)])) for p in peaks]
-
-
 def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
     """Mean of the ring around each pixel, and the standard deviation from that mean or from a fitted plane.
 
@@ -268,13 +250,12 @@ def _first_moment(half: Image, side: int, axis: int) -> Array:
     return np.asarray(cv2.sepFilter2D(half, cv2.CV_32F, kernels[0], kernels[1]))
 
 
-def _outline(levels: Sequence[Image], peak: _Peak, large: bool, of_difference: bool) -> SmallTarget | None:
+def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> SmallTarget | None:
     """Find the box of a peak, in the image of a finer scale; None if its outline leaves the ring.
 
     Args:
         levels: image, (H, W), and its halvings.
         peak: the peak.
-        large: whether faint parts belong to the target.
         of_difference: whether the target is brighter than its surroundings in all its parts, as in a difference.
     """
     scale, around = peak.scale, peak.around
@@ -291,11 +272,6 @@ def _outline(levels: Sequence[Image], peak: _Peak, large: bool, of_difference: b
     # An aeroplane has bright and dark parts.
     inside = window * np.sign(contrast) if of_difference else np.abs(window)
     x, y, w, h = _component(inside > OUTLINE * abs(contrast), at)
-    if large and not of_difference:
-        part = min(OUTLINE, max(FAINT / peak.signal, FAINTEST))
-        X, Y, W, H = _component(np.abs(window - _slope(window)) > part * abs(contrast), at)
-        if max(x - X, y - Y, X + W - x - w, Y + H - y - h) * unit > BLUR_PX + unit:
-            x, y, w, h = X, Y, W, H
     bottom, right = window.shape
     across = (x == 0 and left > 0) or (x + w == right and left + right < image.shape[1])
     down = (y == 0 and top > 0) or (y + h == bottom and top + bottom < image.shape[0])
@@ -304,28 +280,16 @@ def _outline(levels: Sequence[Image], peak: _Peak, large: bool, of_difference: b
     return SmallTarget((unit * (left + x), unit * (top + y)), (unit * w, unit * h), contrast, peak.signal, around)
 
 
-def _slope(window: np.ndarray) -> np.ndarray:
-    """Estimate the surroundings' slope from the window's border, zero in the middle, (h, w)."""
-    down, across = (
-        (_median(last) - _median(first)) * np.linspace(-0.5, 0.5, n, dtype=np.float32)
-        for first, last, n in (
-            (window[0], window[-1], window.shape[0]),
-            (window[:, 0], window[:, -1], window.shape[1]),
-        )
-    )
-    return down[:, None] + across
-
-
-def _median(values: np.ndarray) -> float:
-    """Median of a few values, (n,), eight times as fast as np.median."""
-    ordered, n = np.sort(values), len(values)
-    return float(ordered[(n - 1) // 2] + ordered[n // 2]) / 2
-
-
 def _component(inside: np.ndarray, at: tuple[int, int]) -> tuple[int, int, int, int]:
     """Find the box of the connected component at a pixel (row, column): left, top, width and height."""
     x, y, w, h = cv2.floodFill(inside.astype(np.uint8), None, at[::-1], (2,), flags=8)[3]
     return x, y, w, h
+
+
+def mostly_in(part: SmallTarget, whole: SmallTarget) -> bool:
+    """Whether more than half of a region's box lies in another's."""
+    sides = zip(part.low, part.size, whole.low, whole.size, strict=True)
+    return 2 * math.prod(max(0, min(a + n, b + m) - max(a, b)) for a, n, b, m in sides) > math.prod(part.size)
 
 
 def share(one: SmallTarget, other: SmallTarget) -> bool:

@@ -20,8 +20,10 @@ from cotarget.detection.small_target.contrast import (
     SCALES_OF_DIFFERENCE,
     SmallTarget,
     find_small_targets,
+    mostly_in,
     share,
 )
+from cotarget.detection.small_target.plain import find_wholes
 from cotarget.detection.small_target.score import WEIGHTS, Weights, small_target_score
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image
@@ -118,7 +120,8 @@ class SmallTargetDetector:
         found: list[tuple[SmallTarget, Detection]] = []
         arrived: list[tuple[SmallTarget, Detection]] = []
         noisy = times == MOST_TIMES and self._history.noise > LEAST_ROUGHNESS
-        for target in find_small_targets(grey, NOISY_SIGNAL if noisy else LEAST_SIGNAL, MOST_TARGETS, finer=finer):
+        small = find_small_targets(grey, NOISY_SIGNAL if noisy else LEAST_SIGNAL, MOST_TARGETS, finer=finer)
+        for target in [*find_wholes(grey, unit), *small]:
             low = target.low[0] // unit, target.low[1] // unit
             size = -(-target.size[0] // unit), -(-target.size[1] // unit)
             since = changes(grey, low, size, target.around, shift, self._history.noise, references)
@@ -130,7 +133,13 @@ class SmallTargetDetector:
             if detection.score >= BELIEVED_SCORE and np.nanmax(since) >= ARRIVED:
                 arrived.append((target, detection))
         differing = self._differing(grey, unit, times, shift, references)
-        found = _best_of(found + [_as_a_whole(pair, arrived) for pair in differing])
+        found += [_as_a_whole(pair, arrived) for pair in differing]
+        wholes: list[tuple[SmallTarget, Detection]] = []
+        for pair in sorted(arrived, key=lambda pair: -math.prod(pair[0].size)):
+            if pair[0].whole and not any(mostly_in(pair[0], whole) for whole, _ in wholes):
+                wholes.append(pair)
+        found = _best_of([pair for pair in found if not any(mostly_in(pair[0], whole) for whole, _ in wholes)])
+        found = sorted(wholes + found, key=lambda pair: -pair[1].score)
         boxes = [detection for _, detection in found]
         return [target for target, _ in found], Detections(
             boxes, functools.partial(_mask, found, frame.image.shape, times)
