@@ -179,6 +179,7 @@ class Line(SerialLine):
         super().__init__(port, name, baud, clock)
         self._buffer = b""
         self._strange = b""  # the last line that was no answer
+        self._refusal = ""  # the last one during `resync`
         self.events: list[str] = []  # "P", "T" and "D" as the unit sent them; the user of the line removes them
         self.strict = False  # set once the unit's echo is off; from then on text before an answer is an error
         # Returns whether the head is to be halted now, so that an answer in flight gets `HURRY_S` at most.
@@ -259,10 +260,12 @@ class Line(SerialLine):
 
         Raises:
             SilentError: the unit does not answer any more; a halt was sent.
+            RefusedError: it answers, but refuses every query; a halt was sent.
             PositionLostError: the unit was switched off and on.
             LostError: the port failed.
         """
         log.info("%s: synchronizing after: %s", self.name, reason)
+        self._refusal = ""
         noise, self._strange = self._strange + self._buffer, b""
         self.write(DELIMITER + HALT if self.hurry() else DELIMITER)
         noise += self.drain(QUIET_S, DRAIN_S)
@@ -276,6 +279,10 @@ class Line(SerialLine):
         back = any(self._answers(command("F"), terse, QUICK_S) for _ in range(LAST_TRIES))
         if not (back and self._answers(command("E"), lambda text: not echoing(text), LAST_S)):
             self.write(DELIMITER + HALT)
+            if self._refusal:
+                raise RefusedError(
+                    f"the pan-tilt unit at {self.name} refused every query: {self._refusal}; a halt was sent"
+                )
             raise SilentError(f"the pan-tilt unit at {self.name} does not answer any more; a halt was sent")
         log.warning("%s: the pan-tilt unit did not answer for a while and was halted", self.name)
         return True
@@ -367,7 +374,9 @@ class Line(SerialLine):
                 continue
             if well:
                 return True
-            if reply is not None and not reply.refused:
+            if reply is not None and reply.refused:
+                self._refusal = reply.text
+            elif reply is not None:
                 raise self._restarted()
         return False
 

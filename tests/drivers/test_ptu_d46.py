@@ -9,7 +9,14 @@ from dataclasses import replace
 import pytest
 import serial
 
-from cotarget.drivers.link_errors import InUseError, LostError, NoPermissionError, PositionLostError, SilentError
+from cotarget.drivers.link_errors import (
+    InUseError,
+    LostError,
+    NoPermissionError,
+    PositionLostError,
+    RefusedError,
+    SilentError,
+)
 from cotarget.drivers.ptu_d46 import D46Head, D46Settings, UncalibratedError
 from cotarget.drivers.ptu_protocol import open_line
 from cotarget.errors import ConfigError, DeviceError
@@ -472,6 +479,14 @@ def says(order, reply, count=1):
     return lambda bench: bench.unit.scripted.update({order: [reply] * count})
 
 
+def refuses(bench):
+    """Every command but a halt, after one answer that does not come."""
+    answer, bench.unit.scripted = bench.unit.answer, {"TP": [None], "PP": [None]}
+    bench.unit.answer = lambda order: (
+        answer(order) if order == "H" or bench.unit.scripted.get(order) else b"! Illegal command\r\n"
+    )
+
+
 def power_cycled(bench):
     bench.unit.echo = bench.unit.verbose = True
 
@@ -494,6 +509,7 @@ def unplugged(error):
 # Fault while the head turns: what happens, the error that it ends in, and a text of that.
 ENDS = {
     "silent": (silent, SilentError, "halt"),
+    "refuses everything": (refuses, RefusedError, "Illegal command"),
     "answers something else": (says("TP", b"* 1 2\r\n", 10), DeviceError, "'1 2'"),
     "unplugged": (unplugged(OSError(5, "Input/output error")), LostError, "PORT"),
     "unplugged, says pyserial": (unplugged(serial.SerialException("device reports readiness")), LostError, "PORT"),
