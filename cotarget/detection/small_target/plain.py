@@ -60,6 +60,14 @@ def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
         if beside > FAINTEST * contrast:
             continue
         around = float(ground[y : y + h, x : x + w].mean())
-        low, size = ((times * unit * a, times * unit * b) for a, b in ((x, y), (w, h)))
+        outline = sharp[y : y + h, x : x + w]
+        (left, right), (top, bottom) = (_ends(outline.max(axis=axis)) for axis in (0, 1))
+        ends = [round(times * unit * end) for end in (x + left, y + top, x + right, y + bottom)]
+        low, size = (ends[0], ends[1]), (ends[2] - ends[0], ends[3] - ends[1])
         found.append(SmallTarget(low, size, contrast, contrast / usual, around, beside, whole=True))
     return found
+
+
+def _ends(profile: Image) -> tuple[float, float]:
+    """Find where a region of a row of differences begins and ends, whose first and last pixels it covers in part."""
+    return 1 - profile[0] / profile[:2].max(), len(profile) - 1 + profile[-1] / profile[-2:].max()
