@@ -7,7 +7,7 @@ medians over the steps.
 1. Image effects off: a step, and mujoco.Renderer drawing the same two frames of the same world, with the same size,
    antialiasing, focal length and pose, the poses being prepared.
 2. Each image effect alone, and all of them, against none. Blur is that of 1/100 s under a turning head. The same with
-   all of them at 1920x1080, with the processor's time of all threads.
+   all of them, and all but clutter, at 640x480 and 1920x1080, with the processor's time of all threads.
 3. Seconds of simulated time per second of the whole pipeline following a bird, as in `experiments.following.hold`: both
    cameras rendered with all effects; and nothing rendered, with detections from ground truth. For the latter, the time
    of the simulation alone is given too.
@@ -41,7 +41,12 @@ TURN, TURN_S = 0.15, 1.5  # amplitude [rad] and period [s] of the head's swing
 ZOOMED = 3.0  # factor on the shortest focal length
 SETTLED_S = 1.0  # time before anything is timed; the lens has arrived then
 RENDERER, LOOP, ALL = "mujoco.Renderer", "loop", "all of them"
-SIZES = ((640, 480), (1920, 1080))
+# Timed cases of size and image effects; clutter changes all of the fixed camera's picture from frame to frame.
+SIZED: Mapping[str, tuple[tuple[int, int], tuple[str, ...]]] = {
+    f"{size[0]}x{size[1]}{words}": (size, tuple(name for name in IMAGE_EFFECTS if name not in without))
+    for size in ((640, 480), (1920, 1080))
+    for words, without in (("", ()), (", no clutter", ("clutter",)))
+}
 # Goals: least and largest value.
 WANTED: Mapping[str, tuple[float, float]] = {
     "loop_over_renderer": (0.0, 1.15),
@@ -73,7 +78,7 @@ def one(settings: SimSpeedSettings, seed: int) -> list[Row]:
     return rows
 
 
-def config_with(seed: int, on: Sequence[str], size: tuple[int, int] = SIZES[0]) -> RigConfig:
+def config_with(seed: int, on: Sequence[str], size: tuple[int, int] = (640, 480)) -> RigConfig:
     """Configure the bird to follow with these image effects only; other effects are unchanged."""
     config = hold_config(TARGET, seed)
     effects = replace(config.sim.effects, **{name: name in on for name in IMAGE_EFFECTS})
@@ -142,17 +147,17 @@ def _beside_none(settings: SimSpeedSettings, seed: int) -> list[Row]:
 
 
 def _sized(settings: SimSpeedSettings, seed: int) -> list[Row]:
-    """Time steps with all image effects at each size, in real time and in the processor's."""
+    """Time the steps of `SIZED`, in real time and in the processor's."""
     rows = []
-    for size in SIZES:
-        stepper = Stepper(config_with(seed, IMAGE_EFFECTS, size))
+    for what, (size, effects) in SIZED.items():
+        stepper = Stepper(config_with(seed, effects, size))
         with stepper.world.rig:
             stepper.step()  # the first step fills caches
             for i in range(settings.steps):
                 began = time.process_time()
                 ms = 1e3 * stepper.step()
                 cpu_ms = 1e3 * (time.process_time() - began)
-                rows.append({"seed": seed, "what": f"{size[0]}x{size[1]}", "step": i, "ms": ms, "cpu_ms": cpu_ms})
+                rows.append({"seed": seed, "what": what, "step": i, "ms": ms, "cpu_ms": cpu_ms})
     return rows
 
 
@@ -217,7 +222,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     }
     sizes = {
         what: {"ms": float(np.median(of(what))), "cpu_ms": float(np.median(of(what, "cpu_ms")))}
-        for what in (f"{w}x{h}" for w, h in SIZES)
+        for what in SIZED
         if len(of(what))  # rows of 0.1.0 have none
     }
     return {
