@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import sys
 
 import pytest
@@ -31,6 +32,19 @@ def _bytecode(tmp_path_factory):
 def _state_home(tmp_path_factory, monkeypatch):
     """A state folder for each test: a unit whose position one test loses is no unit of the next, nor of the user."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / f"state-{os.urandom(8).hex()}"))
+
+
+@pytest.fixture(autouse=True)
+def _no_name_server(monkeypatch):
+    """Names of hosts are not asked for on a network; a machine without one waits five seconds for each."""
+    find = socket.getaddrinfo
+
+    def find_here(host, *args, **kwargs):
+        if host and not set(host.strip("[]")) <= set("0123456789abcdefABCDEF.:") and host != "localhost":
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+        return find(host, *args, **kwargs)
+
+    monkeypatch.setattr(socket, "getaddrinfo", find_here)
 
 
 def pytest_configure(config):
