@@ -60,14 +60,18 @@ def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
         if beside > FAINTEST * contrast:
             continue
         around = float(ground[y : y + h, x : x + w].mean())
-        outline = sharp[y : y + h, x : x + w]
-        (left, right), (top, bottom) = (_ends(outline.max(axis=axis)) for axis in (0, 1))
-        ends = [round(times * unit * end) for end in (x + left, y + top, x + right, y + bottom)]
-        low, size = (ends[0], ends[1]), (ends[2] - ends[0], ends[3] - ends[1])
+        low, size = _outline(grey, ground, (x, y, w, h), unit, max(unit * TIMES * usual, FAINTEST * contrast))
+        low, size = (times * low[0], times * low[1]), (times * size[0], times * size[1])
         found.append(SmallTarget(low, size, contrast, contrast / usual, around, beside, whole=True))
     return found
 
 
-def _ends(profile: Image) -> tuple[float, float]:
-    """Find where a region of a row of differences begins and ends, whose first and last pixels it covers in part."""
-    return 1 - profile[0] / profile[:2].max(), len(profile) - 1 + profile[-1] / profile[-2:].max()
+def _outline(
+    grey: Image, ground: Image, box: tuple[int, int, int, int], unit: int, least: float
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Find low and size of a region in full resolution from its box in an image reduced by a factor ``unit`` [px]."""
+    x, y, w, h = box
+    before = cv2.resize(ground[y : y + h, x : x + w], None, fx=unit, fy=unit, interpolation=cv2.INTER_LINEAR)
+    now = grey[unit * y : unit * (y + h), unit * x : unit * (x + w)]
+    dx, dy, w, h = cv2.boundingRect(cv2.compare(cv2.absdiff(now, before), least, cv2.CMP_GT))
+    return (unit * x + dx, unit * y + dy), (w, h)
