@@ -560,17 +560,63 @@ class SafetyConfig:
     stop_file: Annotated[NotEmptyPath, Check(_file_name)] | None = None
 
 
+FEWEST_POINTS = 3  # of a polygon
+
+
+def _point(value: Any) -> Any:
+    numbers = value if isinstance(value, list) else []
+    if len(numbers) != 2 or not all(type(each) in (int, float) and 0 <= each <= 1 for each in numbers):
+        raise ValueError(f"{value!r} is no point; give [u, v] in parts of the image's width and height, from 0 to 1")
+    return tuple(numbers)
+
+
+def _polygon(points: tuple[Pair, ...]) -> tuple[Pair, ...]:
+    if len(points) < FEWEST_POINTS:
+        raise ValueError(f"{len(points)} points enclose nothing; give three or more, each [u, v]")
+    return points
+
+
+Polygon = Annotated[tuple[Annotated[Pair, Check(_point, before=True)], ...], "[[u, v], ...]", Check(_polygon)]
+
+
 @model
 class FollowConfig:
-    """What `cotarget follow` takes where its options do not say.
+    """What `cotarget follow` takes where its options do not say, and where it looks for no target.
 
     Attributes:
         target: name of the target; by default the only one of a simulated scene.
         calibration: the rig's calibration, relative to rig.toml; calibration.json beside rig.toml by default.
+        ignored: regions of the fixed camera's image in which nothing is detected, such as a clock, a flag or a road:
+            polygons of three or more points, in parts of the image from 0 to 1, u to the right and v down.
     """
 
     target: str | None = None
     calibration: FilePath | None = None
+    ignored: tuple[Polygon, ...] = ()
+
+
+@model
+class _IgnoredFile:
+    """A file of ignored regions alone, see `FollowConfig`."""
+
+    ignored: tuple[Polygon, ...]
+
+
+def read_ignored(path: Path) -> tuple[Polygon, ...]:
+    """Read ignored regions from a file with the one key `ignored`, or from the table [follow] of a rig.toml.
+
+    Raises:
+        ConfigError: the file is missing, is not TOML, holds no region, or has an unknown key or an impossible value.
+    """
+    tables = read_tables(path)
+    if "follow" in tables:
+        found = config_of(read_text(path), path).follow.ignored
+    else:
+        with naming(path):
+            found = validate(_IgnoredFile, tables, "").ignored
+    if not found:
+        raise ConfigError(f"{path}: holds no region; give ignored = [[[u, v], [u, v], [u, v]]], or [follow] ignored")
+    return found
 
 
 @model
@@ -584,7 +630,7 @@ class RigConfig:
         recording: folder of the recording, for the backend "replay"; relative to rig.toml.
         board: the calibration board.
         safety: limits of motion.
-        follow: what to follow.
+        follow: what to follow, and where to look for nothing.
         targets: target profiles by name.
     """
 
@@ -711,11 +757,11 @@ def config_table(config: RigConfig) -> dict[str, Any]:
     """Convert a configuration to tables that `parse_config` reads.
 
     Passwords are left out, and so is what would keep a replay from running, such as the stop file, or is not of the
-    rig, such as what to follow.
+    rig, such as which target to follow.
     """
     table: dict[str, Any] = as_table(replace(config, recording=None))
     table["safety"].pop("stop_file", None)
-    del table["follow"]
+    table["follow"] = {"ignored": table["follow"]["ignored"]}
     devices = {name: _without_secrets(device) for name, device in table.pop("hardware").items() if device}
     return table | ({"hardware": devices} if devices else {})
 

@@ -4,7 +4,7 @@ import itertools
 import math
 import textwrap
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,10 +14,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
+from cotarget.config import Polygon
 from cotarget.files import write_atomically
 from cotarget.geometry import Array
 from cotarget.metrics import Row
-from cotarget.pipeline import State, Step
+from cotarget.pipeline import State, Step, outline_px
 from cotarget.rig import Image
 
 OFFSET, FOCAL = "#1f6f8b", "#777777"  # colours of the curves
@@ -56,9 +57,9 @@ def aim_error_figure(rows: Mapping[str, Sequence[Row]]) -> Figure:
     return figure
 
 
-# Colours (BGR): boxes of tracks and of the followed one, cross, text, and what is behind them; arrows.
+# Colours (BGR): boxes of tracks and of the followed one, cross, text, and what is behind them; arrows; ignored regions.
 FOUND, FOLLOWED, CROSS = (230, 230, 0), (0, 200, 255), (80, 220, 80)
-INK, PAPER, DARK, ARROW = (40, 40, 40), (250, 250, 250), (20, 20, 20), (0, 120, 235)
+INK, PAPER, DARK, ARROW, DIM = (40, 40, 40), (250, 250, 250), (20, 20, 20), (0, 120, 235), (130, 130, 130)
 FULL_WIDTH_PX = 640  # lines, letters and captions grow with images wider than this; the lengths below are at this width
 FULL_HEIGHT_PX = 480  # smaller images are enlarged to this height in a film
 LETTER_SCALE = 0.55  # OpenCV's scale of the font
@@ -129,6 +130,13 @@ def draw_box(
     write_text(image, label, (left, above), colour)
 
 
+def draw_ignored(image: Image, ignored: Iterable[Polygon]) -> None:
+    """Outline regions in which nothing is detected with a dim line; the image is changed."""
+    line, outlines = round(_scale_of(image)), [outline_px(each, image) for each in ignored]
+    for colour, width in ((DARK, 3 * line), (DIM, line)):
+        cv2.polylines(image, outlines, True, colour, width, cv2.LINE_AA)
+
+
 def write_picture(path: Path, image: Image) -> None:
     """Write an image as PNG, which appears under its name when complete.
 
@@ -152,6 +160,7 @@ def captioned(image: Image, text: str) -> Image:
 def draw_wide(step: Step, factor: float = 1.0) -> Image:
     """Draw the fixed camera's frame, enlarged by a factor, with boxes of confirmed tracks; the followed one differs."""
     image = _enlarged(step.fixed.image, factor)
+    draw_ignored(image, step.ignored)
     for track in step.tracks:
         if track.confirmed:
             followed = step.target is not None and track.id == step.target.id

@@ -11,11 +11,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Real
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.plausibility import check_plausible
-from cotarget.config import TargetProfile
+from cotarget.config import Polygon, TargetProfile
 from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome, TargetSelector, candidates_of
@@ -53,6 +55,8 @@ WAIT_S = 2e-3
 STALE_S = 0.5
 # Time without a new zoom frame after which the run ends [s]: longer than the 5 s for which a driver tries to reconnect.
 GONE_S = 10.0
+# Colour of ignored regions in the image that the detector gets; see docs/design-notes.md.
+MID_GREY = (128, 128, 128)
 # Longest interval that counts as the period of commands [s]; a longer one was a gap between frames.
 LONGEST_INTERVAL_S = 0.2
 
@@ -192,19 +196,31 @@ class CameraRun:
     """Detect and track in one camera's frames.
 
     Attributes:
+        ignored: regions in which nothing is detected, see `cotarget.config.FollowConfig`.
         tracks: tracks after the last frame; confirmed ones first, then by age.
     """
 
-    def __init__(self, detector: Detector, tracker: Tracker) -> None:
+    def __init__(self, detector: Detector, tracker: Tracker, ignored: Sequence[Polygon] = ()) -> None:
         """Start without tracks."""
-        self._detector, self._tracker = detector, tracker
+        self._detector, self._tracker, self.ignored = detector, tracker, ignored
         self.tracks: list[Track] = []
 
     def track(self, frame: Frame) -> Detections:
         """Detect the targets of a frame, given the tracks after the last one, and update the tracks."""
+        if self.ignored:
+            image = frame.image.copy()
+            for each in self.ignored:  # in one call, what two share would stay
+                cv2.fillPoly(image, [outline_px(each, image)], MID_GREY)
+            frame = replace(frame, image=image)
         found = self._detector.detect(frame, self.tracks)
         self.tracks = self._tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
         return found
+
+
+def outline_px(polygon: Polygon, image: Image) -> npt.NDArray[np.int32]:
+    """Corners of a polygon in parts of an image [px], (n, 2); 0 and 1 are the outer edges of its border's pixels."""
+    height, width = image.shape[:2]
+    return np.rint(np.array(polygon) * (width, height) - 0.5).astype(np.int32)
 
 
 class State(enum.StrEnum):
@@ -272,6 +288,7 @@ class Step:
         head_commands: commands sent to the head since the run began.
         lens_commands: commands sent to the lens since the run began.
         skipped: frames of the fixed camera that were not worked on since the previous step, by its rate.
+        ignored: regions of the fixed frame in which nothing is detected.
     """
 
     index: int
@@ -293,6 +310,7 @@ class Step:
     head_commands: int = 0
     lens_commands: int = 0
     skipped: int = 0
+    ignored: Sequence[Polygon] = ()
 
     def __str__(self) -> str:
         """Say the time, the state with its reason, and the aim."""
@@ -542,7 +560,8 @@ class Run:
         settings = replace(settings, filter=settings.filter or filter_settings(target, calibration))
         self._rig, self._selector = rig, selector
         self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
-        self.camera = CameraRun(detector, Tracker(settings.tracking or tracking_settings(target), rig.fixed.size))
+        tracker = Tracker(settings.tracking or tracking_settings(target), rig.fixed.size)
+        self.camera = CameraRun(detector, tracker, () if rig.config is None else rig.config.follow.ignored)
         self.fusion = TargetFusion(calibration, target, settings.filter, settings.fusion)
         self.head = HeadRun(rig, calibration, target, selector, settings)
         self._index = 0
@@ -591,6 +610,7 @@ class Run:
             head_commands=head.controller.head_commands,
             lens_commands=head.controller.lens_commands,
             skipped=self._skipped(),
+            ignored=self.camera.ignored,
         )
 
     def _skipped(self) -> int:

@@ -18,6 +18,16 @@ DOG = "[targets.dog]\nsize = 0.6\ndimension = 'height'\nwanted_px = 200\ndetecto
 REFUSED = {
     "board.corners": ["'9x6'", "[2, 6]", "[201, 400]", "[8, 6]"],
     "hardware.zoom.lens": ["[6, 72]"],
+    "follow.ignored": [
+        "0.5",
+        "[[[0, 0], [1, 1]]]",  # two points
+        "[[0.1, 0.1], [0.2, 0.1], [0.2, 0.2]]",  # one polygon, and not a list of them
+        "[[[0, 0], [320, 0], [320, 240]]]",  # pixels
+        "[[[0, 0], [0.5, -0.1], [1, 1]]]",
+        "[[[0, 0], [0.5, 0, 1], [1, 1]]]",
+        "[[[0, 0], ['a', 0], [1, 1]]]",
+        "[[[0, 0], [true, 0], [1, 1]]]",
+    ],
     "safety.max_frame_age_s": ["1000"],
     "safety.stop_file": ["''", "'.'", "'run/..'", "1"],
     "safety.tilt_deg": ["30"],

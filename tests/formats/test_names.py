@@ -140,6 +140,7 @@ def test_v010_rig_files_name_every_key():
         "hardware.fixed.password_env",
         "follow.target",
         "follow.calibration",
+        "follow.ignored",
         *(f"hardware.{name}.driver" for name in DRIVERS),
     }
     assert {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in KEYS} - newer == found
