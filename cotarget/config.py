@@ -603,13 +603,13 @@ class _IgnoredFile:
 
 
 def read_ignored(path: Path) -> tuple[Polygon, ...]:
-    """Read ignored regions from a file with the one key `ignored`, or from the table [follow] of a rig.toml.
+    """Read ignored regions from a file with the one key `ignored`, or from [follow] of a rig.toml.
 
     Raises:
         ConfigError: the file is missing, is not TOML, holds no region, or has an unknown key or an impossible value.
     """
     tables = read_tables(path)
-    if "follow" in tables:
+    if tables.keys() & {each.name for each in fields(RigConfig)}:
         found = config_of(read_text(path), path).follow.ignored
     else:
         with naming(path):

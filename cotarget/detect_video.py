@@ -12,9 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cotarget.config import TargetProfile
+from cotarget.config import Polygon, TargetProfile
 from cotarget.detection import make_detector
-from cotarget.drawing import BOX_MARGIN_PX, draw_box, write_picture, write_text
+from cotarget.drawing import BOX_MARGIN_PX, draw_box, draw_ignored, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
@@ -73,6 +73,7 @@ def run_on_film(
     drawn: Path | None = None,
     progress: Progress | None = None,
     keep: bool = False,
+    ignored: Sequence[Polygon] = (),
 ) -> FilmSummary:
     """Detect and track a target in a film.
 
@@ -87,6 +88,7 @@ def run_on_film(
         drawn: film to write with the tracks drawn; None for none.
         progress: called after every frame with (frames done, frames in all or None, what).
         keep: whether to keep the results so far if the run ends in an error.
+        ignored: regions in which nothing is detected, see `cotarget.config.FollowConfig`.
 
     Raises:
         CotargetError: the film cannot be read, or a file cannot be written.
@@ -96,20 +98,21 @@ def run_on_film(
             raise CotargetError(f"{out}: is the film itself; name another file to write")
     with Film(video) as film, CsvFile(csv_path, COLUMNS, keep=keep, line_end="\n") as table:
         if drawn is None:
-            return _run(film, target, table.write, None, progress)
+            return _run(film, target, ignored, table.write, None, progress)
         with FilmWriter(drawn, film.rate_hz, keep=keep) as out_film:
-            return _run(film, target, table.write, out_film.write, progress)
+            return _run(film, target, ignored, table.write, out_film.write, progress)
 
 
 def _run(
     film: Film,
     target: TargetProfile,
+    ignored: Sequence[Polygon],
     write_row: Callable[[list[str]], object],
     write_image: Callable[[Image, float], None] | None,
     progress: Progress | None,
 ) -> FilmSummary:
-    camera = CameraRun(make_detector(target, film.rate_hz), Tracker(tracking_settings(target), film.size))
-    trails = Trails()
+    camera = CameraRun(make_detector(target, film.rate_hz), Tracker(tracking_settings(target), film.size), ignored)
+    trails = Trails(ignored)
     numbers: set[int] = set()
     times = []
     with_target = 0
@@ -143,14 +146,16 @@ def _row(index: int, t: float, track: Track) -> list[str]:
 
 
 class Trails:
-    """Draw tracks as boxes with their id and their trail."""
+    """Draw tracks as boxes with their id and their trail, and the outlines of ignored regions."""
 
-    def __init__(self) -> None:
+    def __init__(self, ignored: Sequence[Polygon] = ()) -> None:
+        self._ignored = ignored
         self._trails: dict[int, list[tuple[float, Array]]] = {}
 
     def draw(self, image: Image, tracks: Sequence[Track], t: float) -> Image:
         """Draw tracks on a copy of an image; a box is thin while its target is only predicted."""
         image = image.copy()
+        draw_ignored(image, self._ignored)
         self._trails = {
             track.id: [at for at in self._trails.get(track.id, []) if at[0] >= t - TRAIL_S] + [(t, track.center_px)]
             for track in tracks
@@ -229,6 +234,7 @@ def run_on_folder(
     sheet: Path | None,
     criterion: Criterion,
     progress: Progress,
+    ignored: Sequence[Polygon] = (),
 ) -> dict[str, Any]:
     """Detect and track a target in films and score the tracks.
 
@@ -239,6 +245,7 @@ def run_on_folder(
         sheet: picture to write, with the longest misses (green) and false tracks (red); None for none.
         criterion: when a track is on a label.
         progress: called before every film with (films done, films in all, what).
+        ignored: regions of all films in which nothing is detected.
 
     Returns:
         "pooled": scores over all films but those whose labels are all beyond their ends; "films": summary and score of
@@ -252,7 +259,7 @@ def run_on_folder(
     for i, ((film, _), boxes) in enumerate(zip(films, labels, strict=True)):
         progress(i, len(films), film.stem)
         table = tables / f"{film.stem}.csv"
-        summary = run_on_film(film, target, table, keep=True)
+        summary = run_on_film(film, target, table, keep=True, ignored=ignored)
         tracks, frames = read_tracks(table), summary.last_frame + 1
         score = score_tracks(tracks, boxes, summary.rate_hz, frames, criterion=criterion)
         if not boxes or min(boxes) < frames:  # otherwise no labelled frame is in the film

@@ -133,7 +133,7 @@ def draw_box(
 def draw_ignored(image: Image, ignored: Iterable[Polygon]) -> None:
     """Outline regions in which nothing is detected with a dim line; the image is changed."""
     line, outlines = round(_scale_of(image)), [outline_px(each, image) for each in ignored]
-    for colour, width in ((DARK, 3 * line), (DIM, line)):
+    for colour, width in ((DARK, 2 * line), (DIM, line)):
         cv2.polylines(image, outlines, True, colour, width, cv2.LINE_AA)
 
 

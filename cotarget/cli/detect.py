@@ -21,7 +21,9 @@ from cotarget.files import STDOUT
 from cotarget.parallel import progress_bar
 
 if TYPE_CHECKING:
-    from cotarget.config import TargetProfile
+    from collections.abc import Sequence
+
+    from cotarget.config import Polygon, TargetProfile
     from cotarget.track_metrics import Criterion
 
 
@@ -40,6 +42,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_file(parser, "--video", "write the video with the tracks drawn (.mp4)", "OUT")
     add_file(parser, "--rig", "rig.toml, for targets of your own")
     about = (
+        "detect nothing in the regions of this file: TOML with ignored = [[[u, v], [u, v], [u, v]], ...], polygons of "
+        "three or more points in parts of the picture from 0 to 1; or a rig.toml, with its [follow] ignored"
+    )
+    add_file(parser, "--ignore", about)
+    about = (
         "score the tracks by these boxes: a csv with frame,x_px,y_px,width_px,height_px, all from 0; x and y are of "
         "the box's top-left pixel; or ground truth of the MOT-challenge; a file without boxes for a video without "
         "targets; for a folder of videos, a folder"
@@ -55,7 +62,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Search a video, or the videos of a folder, and print a summary."""
     from cotarget.backends import load_config
-    from cotarget.config import RigConfig
+    from cotarget.config import RigConfig, read_ignored
     from cotarget.detect_video import labels_of_film, run_on_film
     from cotarget.track_metrics import Criterion, read_tracks
 
@@ -67,9 +74,10 @@ def run(options: argparse.Namespace) -> None:
     criterion = Criterion(options.iou, options.small_px)
     if options.labels is None and criterion != Criterion():
         raise ConfigError("--iou, --small-px: compare tracks with --labels, which are missing")
-    inputs = rig_files(options.rig, config)
+    ignored = () if options.ignore is None else read_ignored(options.ignore)
+    inputs = [*rig_files(options.rig, config), options.ignore]
     if options.film.is_dir():
-        _detect_in_folder(options, target, criterion, inputs)
+        _detect_in_folder(options, target, criterion, inputs, ignored)
         return
     if options.sheet is not None:
         raise ConfigError(f"--sheet: shows the mistakes in a folder of videos, and {options.film} is none")
@@ -79,7 +87,7 @@ def run(options: argparse.Namespace) -> None:
     check_outputs([table, options.video], [options.film, options.labels, *inputs])
     labels = None if options.labels is None else labels_of_film(options.film, options.labels)
     with progress_bar() as progress:
-        found = run_on_film(options.film, target, options.csv, options.video, progress, keep=True)
+        found = run_on_film(options.film, target, options.csv, options.video, progress, keep=True, ignored=ignored)
     whole = found.shortfall is None
     if labels and whole and min(labels) > found.last_frame:
         raise ConfigError(
@@ -94,7 +102,11 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _detect_in_folder(
-    options: argparse.Namespace, target: "TargetProfile", criterion: "Criterion", inputs: list[Path | None]
+    options: argparse.Namespace,
+    target: "TargetProfile",
+    criterion: "Criterion",
+    inputs: list[Path | None],
+    ignored: "Sequence[Polygon]",
 ) -> None:
     """Score the videos of a folder by the labels of another; ``inputs`` are other files that are read."""
     from cotarget.detect_video import labelled_films, run_on_folder
@@ -114,7 +126,7 @@ def _detect_in_folder(
     if options.sheet is not None and options.sheet.suffix.lower() != ".png":
         raise ConfigError(f"--sheet: {options.sheet}: a PNG is written; name a .png")
     with progress_bar() as progress:
-        found = run_on_folder(films, target, options.csv, options.sheet, criterion, progress)
+        found = run_on_folder(films, target, options.csv, options.sheet, criterion, progress, ignored)
     if not (found["pooled"]["films"] or any(one["shortfall"] for one in found["films"].values())):
         raise ConfigError(
             f"{options.labels}: no labelled frame is in any of the films; give the labels of these films, with frames "

@@ -26,6 +26,7 @@ from cotarget.drivers.rig import devices
 from cotarget.errors import CalibrationError
 from cotarget.geometry import pose
 from cotarget.tracking.track import Track
+from cotarget.video import Film
 from experiments.calibration.synthetic.rig import Truth, undistorted
 from experiments.engine import LINEAR_ALGEBRA
 from tests.support.commands import OLD, bird_film, call, refused, true_calibration, write_index
@@ -250,6 +251,25 @@ def test_detect_writes_a_table(folder, capsys):
     status, out, err = call(capsys, *detect, "-")  # the table goes to stdout, and the summary to stderr
     assert (status, out, json.loads(err)) == (0, table, printed)
     assert not (folder / "-").exists()
+
+
+@pytest.mark.parametrize("text", ["", "[follow]\n"])
+def test_detect_ignores_the_regions_of_a_file(folder, capsys, text):
+    """Of the file alone, or of a rig.toml; the bird flies at 0.43 of the height, and the video outlines the region."""
+    bird_film(folder / "sky.mp4")
+    (folder / "regions.toml").write_text(f"{text}ignored = [[[0, 0.3], [1, 0.3], [1, 0.8], [0, 0.8]]]\n")
+    detect = ("detect", "sky.mp4", "--target", "bird", "--csv", "out.csv", "--video", "out.mp4")
+    assert json.loads(call(capsys, *detect)[1])["tracks"] == 1
+    status, out, err = call(capsys, *detect, "--ignore", "regions.toml")
+    assert (status, err, json.loads(out)["tracks"]) == (0, "", 0)
+    pictures = []
+    for name in ("sky.mp4", "out.mp4"):
+        with Film(folder / name) as film:
+            pictures.append(next(iter(film)).image.astype(int))
+    off = np.abs(pictures[0] - pictures[1])[:, 20:-20].max(axis=(1, 2)) / 255  # between the region's ends
+    line, height = round(0.3 * len(off)), len(off)
+    assert off[line - 2 : line + 3].max() > 0.1
+    assert off[round(0.5 * height) : round(0.65 * height)].max() < 0.1  # what is inside is shown
 
 
 def test_version(capsys):

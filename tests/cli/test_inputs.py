@@ -33,6 +33,7 @@ def made(tmp_path_factory):
     record(folder / "run", calibration_file(folder), seconds=0.2)
     (folder / "rig.toml").write_text(RIG.format(backend="sim"))
     (folder / "replay.toml").write_text(RIG.format(backend="replay"))
+    (folder / "regions.toml").write_text("ignored = [[[0, 0], [1, 0], [1, 1]]]\n")
     (folder / "hall.xml").write_text("<mujoco/>")
     (folder / "cover.png").write_bytes(b"a cover")
     (folder / "labels.csv").write_text("frame,x_px,y_px,width_px,height_px\n")
@@ -77,6 +78,7 @@ REFUSED = [
     (("replay", "run", "--labels", "labels.csv", "--csv"), "labels.csv"),
     *((DETECT, name) for name in INPUTS if name != "rig_calibration.json"),
     *(((*DETECT, "new.csv", "--video"), name) for name in INPUTS if name != "rig_calibration.json"),
+    (("detect", "film.mp4", "--ignore", "regions.toml", "--target", "bird", "--csv"), "regions.toml"),
     *((IN_FOLDER, name) for name in ("rig.toml", "hall.xml", "cover.png", "films/film.mp4", "films/film.csv")),
     *(((*CALIBRATE, "--out"), name) for name in ("rig.toml", "hall.xml", "stop", "cover.png", "link")),
     (("calibrate", "--rig", "replay.toml", "--out"), "run/log.jsonl"),
