@@ -17,7 +17,7 @@ from cotarget.detection import make_detector
 from cotarget.drawing import BOX_MARGIN_PX, draw_box, draw_ignored, write_picture, write_text
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
-from cotarget.geometry import Array
+from cotarget.geometry import Array, within_image
 from cotarget.parallel import Progress
 from cotarget.pipeline import CameraRun
 from cotarget.rig import Image
@@ -120,7 +120,7 @@ def _run(
         camera.track(frame)
         tracks = [track for track in camera.tracks if track.confirmed]
         for track in tracks:
-            write_row(_row(film.number, frame.t, track))
+            write_row(_row(film.number, frame.t, track, film.size))
         numbers.update(track.id for track in tracks)
         with_target += bool(tracks)
         times.append(frame.t)
@@ -139,8 +139,9 @@ def _run(
     )
 
 
-def _row(index: int, t: float, track: Track) -> list[str]:
-    numbers = (*track.center_px, *track.size_px)
+def _row(index: int, t: float, track: Track, size: tuple[int, int]) -> list[str]:
+    center, extent = within_image(track.center_px, track.size_px, size)
+    numbers = (*center, *extent)
     score = track.score if track.missed == 0 else 0.0
     return [str(index), f"{t:.4f}", str(track.id), *(f"{x:z.2f}" for x in numbers), f"{score:.3g}"]
 

@@ -72,6 +72,13 @@ def angle_between(a: Array, b: Array) -> Array:
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
 
 
+def within_image(center_px: Array, size_px: Array, image_size: tuple[int, int]) -> tuple[Array, Array]:
+    """Return centre and size of the part of a box that lies in an image of a (width, height) [px], (2,) each."""
+    first, last = center_px - size_px / 2, center_px + size_px / 2
+    first, last = np.maximum(first, -0.5), np.minimum(last, np.array(image_size) - 0.5)
+    return (first + last) / 2, np.maximum(last - first, 0.0)
+
+
 def intersection_areas(center: Array, size: Array, others_center: Array, others_size: Array) -> Array:
     """Compute the areas that boxes share with others.
 

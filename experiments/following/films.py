@@ -30,9 +30,9 @@ import numpy as np
 from cotarget.config import DEFAULT_TARGETS, DetectorName, TargetProfile
 from cotarget.detect_video import FILMS, labelled_films
 from cotarget.detection import Detector, make_detector
-from cotarget.detection.background import pieces
-from cotarget.detection.base import box_detection, moved
+from cotarget.detection.base import box_detection, moved, pieces
 from cotarget.files import read_table
+from cotarget.geometry import within_image
 from cotarget.pipeline import CameraRun
 from cotarget.rig import Detection, Frame, Image
 from cotarget.track_metrics import (
@@ -427,9 +427,12 @@ def _components(mask: Image) -> list[tuple[int, Detection]]:
 
 
 def _confirmed(tracker: Tracker, index: int, frame: Frame) -> list[Tracked]:
-    """Give the confirmed tracks of a frame as boxes."""
+    """Give the confirmed tracks of a frame as boxes, which end at the image's border as labels do."""
+    height, width = frame.image.shape[:2]
     return [
-        Tracked(track.center_px, track.size_px, index, frame.t, track.id) for track in tracker.tracks if track.confirmed
+        Tracked(*within_image(track.center_px, track.size_px, (width, height)), index, frame.t, track.id)
+        for track in tracker.tracks
+        if track.confirmed
     ]
 
 
