@@ -121,6 +121,7 @@ def _parameter(rows: Sequence[Row]) -> dict[str, float]:
         "first_sigma": rows[0]["sigma"],
         "found": float(np.mean([row["found"] for row in rows])),
         "sigma": sigma,
+        "usual_sigma": float(np.median([row["sigma"] for row in rows])),
         "error": rms(errors),
         "least_error": min(errors),
         "largest_error": max(errors),
@@ -131,12 +132,13 @@ def _parameter(rows: Sequence[Row]) -> dict[str, float]:
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Give the largest predicted deviation of each kind of parameter, and how far the ratios are from 1.
 
-    The error of one parameter in one run is random, and has no bound.
+    The deviation is the median over the seeds: with few placements, one in five plans predicts four times as much. The
+    error of one parameter in one run is random, and has no bound.
     """
     kinds = {"focal length, px": LENS[:2], "centre, px": LENS[2:], "translation, mm": PLACES, "rotation, deg": TURNS}
     return {
         of: {
-            f"sigma of {kind}": max(parameters[name]["sigma"] for name in names)
+            f"sigma of {kind}": max(parameters[name]["usual_sigma"] for name in names)
             for kind, names in kinds.items()
             if names[0] in parameters
         }
@@ -233,5 +235,5 @@ def _errors(summary: Mapping[str, Any]) -> Iterator[list[Any]]:
 
 
 SETTINGS = Settings()
-QUICK = dataclasses.replace(SETTINGS, seeds=1, placements=12)
+QUICK = dataclasses.replace(SETTINGS, placements=12)
 COST_S = 20.0
