@@ -18,7 +18,7 @@ import numpy as np
 from annotated_types import Gt
 
 from cotarget.config import RigConfig
-from cotarget.detection import AutoDetector, BackgroundDetector, SmallTargetDetector, make_detector
+from cotarget.detection import AutoDetector, Mog2Detector, make_detector
 from cotarget.errors import CotargetError
 from cotarget.evaluation import true_calibration
 from cotarget.fusion import TargetFusion, ZoomSearch
@@ -34,8 +34,7 @@ PERCENTILES = (50, 95, 99)
 PARTS: Mapping[str, tuple[tuple[type, str], ...]] = {
     "detect": (
         (AutoDetector, "detect"),
-        (BackgroundDetector, "detect"),
-        (SmallTargetDetector, "detect"),
+        (Mog2Detector, "detect"),
     ),
     "track": ((Tracker, "update"),),
     "position": ((TargetFusion, "add_tracks"),),

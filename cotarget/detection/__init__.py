@@ -1,10 +1,9 @@
-"""Detect targets in the fixed camera: of any kind, by colour (a book), by motion (a person), by contrast (a bird).
+"""Detect targets in the fixed camera: of any kind, by colour (a book), or by a neural network.
 
-`make_detector` makes one of six by name: "auto", which finds what moves or stands out, of any size; "colour";
-"mog2", the paper's adaptive Gaussian mixture, with its foreground cleaned and joined to regions of a target's size;
-"motion", the same mixture made robust against foliage and light; "speck", for small targets that may hover, seen by
-a camera that may shake; and "onnx", a neural network. `ExternalDetector` makes a detector of any function from an image
-to boxes; the name "module:function" stands for one of a user's own.
+`make_detector` makes one by name: "auto", which finds what moves or stands out, of any size; "motion", the same from a
+size on; "speck", the same without a background model; "colour"; "mog2", the paper's adaptive Gaussian mixture; and
+"onnx", a neural network. `ExternalDetector` makes a detector of any function from an image to boxes; the name
+"module:function" stands for one of a user's own.
 """
 
 import cv2
@@ -12,29 +11,26 @@ import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.detection.auto import AutoDetector
-from cotarget.detection.background import BIRD, GENERAL, PERSON, BackgroundDetector, BackgroundSettings, plain
+from cotarget.detection.background import BackgroundDetector
 from cotarget.detection.base import Detections, Detector, ExternalDetector
 from cotarget.detection.color_template import ColorTemplateDetector
+from cotarget.detection.mog2 import FLYING, ON_THE_GROUND, Mog2Detector
 from cotarget.detection.network import Network
 from cotarget.detection.small_target import SmallTargetDetector
 from cotarget.errors import ConfigError
 from cotarget.plugins import is_own, load, reporting
 
 __all__ = [
-    "BIRD",
-    "GENERAL",
-    "PERSON",
     "AutoDetector",
     "BackgroundDetector",
-    "BackgroundSettings",
     "ColorTemplateDetector",
     "Detections",
     "Detector",
     "ExternalDetector",
+    "Mog2Detector",
     "SmallTargetDetector",
     "make_detector",
     "make_network",
-    "plain",
 ]
 
 
@@ -55,14 +51,10 @@ def make_detector(target: TargetProfile, rate_hz: float) -> Detector:
         return ExternalDetector(reporting(load(kind, where), where))
     if kind == "onnx":
         return ExternalDetector(make_network(target))
-    if kind == "auto":
-        return AutoDetector(rate_hz, shape=target.shape)
-    if kind == "speck":
-        return SmallTargetDetector()
-    if kind in ("motion", "mog2"):
-        upright = target.matcher == "upright"
-        settings = BIRD if target.motion == "flying" else PERSON if upright else GENERAL
-        return BackgroundDetector(plain(settings) if kind == "mog2" else settings, rate_hz)
+    if kind in ("auto", "motion", "speck"):
+        return AutoDetector(rate_hz, shape=target.shape, small=kind != "motion", large=kind != "speck")
+    if kind == "mog2":
+        return Mog2Detector(FLYING if target.motion == "flying" else ON_THE_GROUND, rate_hz)
     if target.template is None:
         raise ConfigError('a target with detector = "colour" needs a template, a picture of the target')
     if not target.template.exists():

@@ -11,7 +11,7 @@ docs/design-notes.md.
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -20,8 +20,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.detection.background import LARGE, PERSON, BackgroundDetector
+from cotarget.detection.background import LEAST_PART, WIDE, BackgroundDetector
 from cotarget.detection.base import Detections
+from cotarget.detection.exposure import Exposure
 from cotarget.detection.small_target import WEIGHTS, SmallTarget, SmallTargetDetector, Weights
 from cotarget.geometry import Array, intersection_areas
 from cotarget.rig import Detection, Frame, Image
@@ -31,11 +32,9 @@ if TYPE_CHECKING:
 
 # Least score of a small target. The tracker begins no track with so little; a target that hovers before trees keeps it.
 LEAST_SCORE = 0.005
-# Score of a large target: alone it confirms no track, but together with the track's travel.
-LARGE_SCORE = 0.3
-# In parts of the image's width: least larger side of a large target; most that a camera shakes, more is a pan; shift at
-# which the background is learnt again, because too much of it is out of view; and least shift that counts.
-LARGE_PART, SHAKE_PART, VIEW_PART, QUIET_PART = 24 / 640, 3 / 640, 0.1, 0.5 / 640
+# In parts of the image's width: most that a camera shakes, more is a pan; shift at which the background is learnt
+# again, because too much of it is out of view; and least shift that counts.
+SHAKE_PART, VIEW_PART, QUIET_PART = 3 / 640, 0.1, 0.5 / 640
 # Time for which a camera that has moved must stand still before large targets are searched [s].
 STEADY_S = 0.2
 # Largest texture beside a target before a plain background [grey levels].
@@ -65,19 +64,29 @@ MOST_GAIN = 0.1
 class AutoDetector:
     """Detect small targets by contrast and change, and large ones by a background model."""
 
-    def __init__(self, rate_hz: float, weights: Weights = WEIGHTS, shape: float | None = None) -> None:
+    def __init__(
+        self,
+        rate_hz: float,
+        weights: Weights = WEIGHTS,
+        shape: float | None = None,
+        *,
+        small: bool = True,
+        large: bool = True,
+    ) -> None:
         """Start without history and background.
 
         Args:
             rate_hz: nominal frame rate [Hz].
             weights: of the score of small targets, see `cotarget.detection.small_target.small_target_score`.
             shape: expected width over height of the target's box; None if it is unknown.
+            small: whether targets may be smaller than LEAST_PART of the image's width.
+            large: whether to search for large ones by a background model, and not only before a plain background.
         """
-        self._shape = shape
+        self._shape, self._with_small, self._with_large = shape, small, large
         self._small = SmallTargetDetector(LEAST_SCORE, weights)
-        upright = shape is not None and shape < LARGE.wide
-        self._large = BackgroundDetector(replace(LARGE, flat=PERSON.flat) if upright else LARGE, rate_hz)
+        self._large = BackgroundDetector(rate_hz, upright=shape is not None and shape < WIDE)
         self._clutter = Clutter()
+        self._exposure = Exposure()
         self._apart: list[Detection] = []  # small targets that are no part of a large one, best first
         self._background: Detections | None = None  # what the background model found last
         self._begun = np.zeros(2)  # the camera's shift when the background was begun [px]
@@ -93,37 +102,43 @@ class AutoDetector:
             CotargetError: the image's size changed.
         """
         width = frame.image.shape[1]
+        exposure = self._exposure.measure(frame)
         self._hold(held, width)
-        targets, contrast = self._small.search(frame)
+        targets, contrast = self._small.search(frame, exposure)
         steady, shift_px = self._register(frame.t, width)
         boxes: list[Detection] = []
         if not self._small.repeated:  # a repeated frame says nothing of where targets usually are
-            boxes = self._boxes(frame, targets, contrast.boxes, shift_px if steady else None)
+            boxes = self._boxes(frame, exposure, targets, contrast.boxes, shift_px if steady else None)
         make_mask = contrast.make_mask
         if steady and self._background is not None:
             make_mask = partial(_mask, self._background, self._apart)
         return Detections(boxes, make_mask, self._small.shift, self._small.camera.jumped)
 
     def _boxes(
-        self, frame: Frame, targets: Sequence[SmallTarget], boxes: Sequence[Detection], shift_px: Array | None
+        self,
+        frame: Frame,
+        exposure: float,
+        targets: Sequence[SmallTarget],
+        boxes: Sequence[Detection],
+        shift_px: Array | None,
     ) -> list[Detection]:
         """Weigh the small targets of a frame, and add the large ones if the background's shift is given, best first."""
         width = frame.image.shape[1]
         found = small = self._clutter.weigh(boxes, frame.t, width, self._held)
-        if shift_px is not None:
-            self._background = self._large.subtract(frame, self._held, shift_px)
-            large = [replace(each, score=LARGE_SCORE) for each in self._background.boxes]
+        if shift_px is not None and self._with_large:
+            self._background = self._large.detect(frame, self._held, shift_px, exposure)
             outlined = [target.whole or target.beside <= PLAIN for target in targets]
-            large = [each for each in large if each.size_px.max() >= LARGE_PART * width]
-            found = fuse(small, outlined, self._are_followed(small, frame.t, width), large)
-            self._apart = [each for each in found if any(each is one for one in small)]
-        return self._by_shape(found)
+            followed = self._are_followed(small, frame.t, width)
+            found = fuse(small, outlined, followed, self._background.boxes, self._likeness)
+        least = 0.0 if self._with_small else LEAST_PART * width
+        found = [each for each in found if each.size_px.max() >= least]
+        self._apart = [each for each in found if any(each is one for one in small)]
+        weighed = [replace(each, score=self._likeness(each) * each.score) for each in found]
+        return sorted(weighed, key=lambda each: -each.score)
 
-    def _by_shape(self, found: Sequence[Detection]) -> list[Detection]:
-        """Weigh the scores by the expected shape, if there is one, but not those of clipped boxes; best first."""
-        if self._shape is not None:
-            found = [each if each.clipped else replace(each, score=by_shape(each, self._shape)) for each in found]
-        return sorted(found, key=lambda each: -each.score)
+    def _likeness(self, found: Detection) -> float:
+        """Likelihood ratio of a detection's shape for the target, at most 1; 1 if either is not known."""
+        return 1.0 if self._shape is None or found.clipped else likeness(found, self._shape)
 
     def _register(self, t: float, width: int) -> tuple[bool, Array]:
         """Whether the camera has stood still for STEADY_S, and the shift since the background was begun (2,) [px]."""
@@ -223,12 +238,17 @@ class Clutter:
 
 
 def fuse(
-    small: Sequence[Detection], outlined: Sequence[bool], followed: Sequence[bool], large: Sequence[Detection]
+    small: Sequence[Detection],
+    outlined: Sequence[bool],
+    followed: Sequence[bool],
+    large: Sequence[Detection],
+    like: Callable[[Detection], float] = lambda _: 1.0,
 ) -> list[Detection]:
     """Make one list of small and large targets, best first.
 
     A large target is not listed where contrast outlines it better: before a plain background, or much larger, as an
-    aeroplane whose front alone has changed. Otherwise the small targets in a large one, such as head and shoes, are
+    aeroplane whose front alone has changed; but not where that is less like the target, as a person with a shadow is.
+    Otherwise the small targets in a large one, such as head and shoes, are
     parts of it, unless a track has followed one of them for itself.
 
     Args:
@@ -236,10 +256,15 @@ def fuse(
         outlined: whether each of these stands before a plain background.
         followed: whether a confirmed track of its size follows it.
         large: targets found by the background model.
+        like: how like the target a box is.
     """
     found = list(small)
     for whole in large:
-        same = [(each, plain) for each, plain in zip(small, outlined, strict=True) if _covered(whole, each) > SAME]
+        same = [
+            (each, plain)
+            for each, plain in zip(small, outlined, strict=True)
+            if _covered(whole, each) > SAME and like(each) >= like(whole)
+        ]
         if any(plain or _covered(each, whole) < MOST for each, plain in same):
             continue
         inside = [each for each, plain in zip(small, outlined, strict=True) if plain and _covered(each, whole) > INSIDE]
@@ -256,8 +281,8 @@ def fuse(
     return sorted(found, key=lambda each: -each.score)
 
 
-def by_shape(found: Detection, shape: float) -> float:
-    """Score of a detection whose odds are multiplied by the likelihood ratio of its shape, if that is less than 1.
+def likeness(found: Detection, shape: float) -> float:
+    """Likelihood ratio of a detection's shape, if that is less than 1.
 
     Args:
         found: the detection.
@@ -265,8 +290,7 @@ def by_shape(found: Detection, shape: float) -> float:
     """
     observed = math.log(found.size_px[0] / found.size_px[1])
     of_target = _normal(observed - math.log(shape), SHAPE_SIGMA) / _normal(observed, OTHER_SIGMA)
-    ratio = min(1.0, OTHER_PART + (1 - OTHER_PART) * of_target)
-    return ratio * found.score / (ratio * found.score + 1 - found.score)
+    return min(1.0, OTHER_PART + (1 - OTHER_PART) * of_target)
 
 
 def _normal(off: float, sigma: float) -> float:

@@ -97,6 +97,22 @@ def moved(image: Image, shift: Array) -> Image:
     return np.asarray(cv2.getRectSubPix(image, (width, height), (u, v)), dtype=np.uint8)
 
 
+def pieces(mask: Image, bridge_px: tuple[int, int]) -> list[Sequence[int]]:
+    """Find the connected components of a mask (H, W), as left, top, width and height [px].
+
+    Gaps of up to (across, down) are closed, and half a gap is included on each side.
+    """
+    left, top, width, height = cv2.boundingRect(mask)  # mostly small, which saves processing the rest
+    if not width:
+        return []
+    across, down = bridge_px
+    x, y = max(left - across // 2, 0), max(top - down // 2, 0)
+    near = mask[y : top + height + down // 2, x : left + width + across // 2]
+    joined = cv2.dilate(near, np.ones((down, across), np.uint8))
+    contours = cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE, offset=(x, y))[0]
+    return [cv2.boundingRect(contour) for contour in contours]
+
+
 def check_size(shape: tuple[int, ...] | None, image: Image) -> None:
     """Refuse an image whose shape differs from that of the last one.
 

@@ -323,11 +323,12 @@ BY_MOTION: Mapping[str, Mapping[str, float]] = {
     "flying": {"noise_of_size": 0.2, "process_noise": 18750.0, "trend": False},
     "general": {},
 }
+AUTO: Mapping[str, float] = {"confirm_score": 0.5, "confirm_travel": 0.25, "least_travel": 0.03, "start_score": 0.02}
 BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
     "colour": {"noise_px": 0.2, "noise_of_size": 0.01},
-    "speck": {"confirm_score": 0.5},
-    "auto": {"confirm_score": 0.5, "confirm_travel": 0.5, "least_travel": 0.03, "start_score": 0.02},
-    "motion": {"confirm_travel": 0.5},
+    "auto": AUTO,
+    "motion": AUTO,
+    "speck": AUTO,
     "mog2": {"confirm_travel": 0.5},
 }
 
@@ -335,8 +336,8 @@ BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
 def tracking_settings(target: TargetProfile) -> TrackingSettings:
     """Choose the tracker's settings for a target profile.
 
-    A colour is located to a fraction of a pixel. What moves need not be the target, so tracks by motion must travel
-    before they are confirmed; a person who walks straight towards the camera is confirmed after moving sideways.
+    A colour is located to a fraction of a pixel. What moves need not be the target, so tracks of `mog2` must travel
+    before they are confirmed; those of `auto` have a score, or half of it and travel.
     Detections of a user's own detector are confirmed by their number alone.
     """
     by_detector = BY_DETECTOR.get(target.detector, {})
@@ -402,8 +403,6 @@ class LiveTrack:
         self.hits = 1
         self.missed = 0
         self.confirmed = False
-        self.is_part = False  # whether it lies in a larger confirmed track
-        self.around: set[int] = set()  # numbers of the tracks that it covered when it began
         self.after_cut = False  # whether the film was cut since the last detection
         self._image_size = image_size
         self.mean_score = 0.0
@@ -462,7 +461,7 @@ class LiveTrack:
         self.detection, self.shared = detection, False
         self.hits += 1
         if not self.confirmed:
-            self.confirmed = self.hits >= self.settings.confirm_hits and not self.is_part and self._has_evidence()
+            self.confirmed = self.hits >= self.settings.confirm_hits and self._has_evidence()
             if self.confirmed:
                 self._trail = None
 

@@ -28,11 +28,8 @@ __all__ = ["Track", "Tracker", "TrackingSettings", "tracking_settings"]
 IMPOSSIBLE = 1e6
 # What lies to this part in a confirmed track's box, enlarged by a factor, belongs to it: a shoe, a rotor.
 PART, NEAR = 0.5, 1.5
-# A track in the box of a larger one is a part of it, such as the hand of a person who comes into view, if both began
-# within a time [s], the areas differ by a factor, and both have moved by the larger one's smaller side with a relative
-# displacement of less than a part of that. A bird before a cloud does not move with it. With that factor of areas, a
-# box around a track begins another one, of which the first is then no part: it may also be a flock around a bird.
-PART_S, PART_AREA, APART = 0.5, 4.0, 0.25
+# A box around a track begins another one if its area is larger by this factor: it may be a flock around a bird.
+LARGER = 4.0
 
 
 class Tracker:
@@ -51,8 +48,6 @@ class Tracker:
         self._image_size = image_size
         self._tracks: list[LiveTrack] = []
         self._next_id = 1
-        # For numbers of a larger track and of one in its box: both centres when it was first there [px, in the scene].
-        self._inside_since: dict[tuple[int, int], tuple[Array, Array]] = {}
         self._t: float | None = None
         self._shift: Array = np.zeros(2)  # of the scene in the last frame [px]
         self._interval = self._settings.lose_s  # between the last two frames [s]
@@ -93,9 +88,7 @@ class Tracker:
             matches = _assign(pairs)
             merged = _merged(pairs, matches)
         taken = set(matches.values())
-        parts = self._parts()
         for i, state in enumerate(self._tracks):
-            state.is_part = parts[i]
             if i in merged:
                 state.correct_shared(detections[merged[i]])
             elif i in matches:
@@ -103,7 +96,6 @@ class Tracker:
             else:
                 state.missed += 1
         self._tracks = [s for s in self._tracks if not s.is_over(self._image_size)]
-        self._end_parts()
         least = self._settings.start_score
         self._start_tracks([each for j, each in enumerate(detections) if j not in taken and each.score >= least], t)
         return self.tracks
@@ -128,38 +120,6 @@ class Tracker:
             state.move(by)
             state.after_cut |= cut
 
-    def _parts(self) -> list[bool]:
-        """Whether each track lies mostly in a larger confirmed one."""
-        at, size = _boxes_of(self._tracks)
-        area = _area(size)
-        confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
-        inside = intersection_areas(at, NEAR * size, at, size) > PART * area
-        larger = area[:, None] > area
-        return np.any(inside & larger & confirmed[:, None], axis=0).tolist()
-
-    def _end_parts(self) -> None:
-        """End each track that has come into view as a part of a larger one and has moved with it since."""
-        confirmed = [state for state in self._tracks if state.confirmed]
-        at, size = _boxes_of(confirmed)
-        area = _area(size)
-        inside = intersection_areas(at, size, at, size) > PART * area
-        inside &= area[:, None] > PART_AREA * area
-        at = at - self._shift  # in the scene, since a camera that turns moves all tracks alike
-        inside_since: dict[tuple[int, int], tuple[Array, Array]] = {}
-        over: set[int] = set()
-        for i, j in np.argwhere(inside).tolist():
-            whole, part = confirmed[i], confirmed[j]
-            measured = not any(state.missed or state.shared for state in (whole, part))
-            if not measured or abs(whole.born - part.born) > PART_S or part.number in whole.around:
-                continue
-            pair = whole.number, part.number
-            start = inside_since[pair] = self._inside_since.get(pair, (at[i], at[j]))
-            displacement, relative = at[i] - start[0], (at[i] - start[0]) - (at[j] - start[1])
-            if np.hypot(*displacement) > size[i].min() and np.hypot(*relative) < APART * np.hypot(*displacement):
-                over.add(part.number)
-        self._tracks = [state for state in self._tracks if state.number not in over]
-        self._inside_since = inside_since
-
     def _most_useful(self, detections: Sequence[Detection]) -> Sequence[Detection]:
         """Select at most `most_detections` detections, in their order."""
         most = self._settings.most_detections
@@ -183,9 +143,8 @@ class Tracker:
         shared = intersection_areas(at, size, center, extent)
         found = np.array([not (state.missed or state.shared) for state in self._tracks], dtype=bool)
         on = shared > covered * _area(size)[:, None]
-        other = found[:, None] & (PART_AREA * _area(size)[:, None] < _area(extent))
+        other = found[:, None] & (LARGER * _area(size)[:, None] < _area(extent))
         free = np.all(~on | other, axis=0)
-        numbers = np.array([state.number for state in self._tracks], dtype=int)
         confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
         near = intersection_areas(at[confirmed], NEAR * size[confirmed], center, extent)
         free &= np.all(near <= PART * _area(extent), axis=0)
@@ -194,7 +153,6 @@ class Tracker:
             if free[j]:  # detections that cover this new track are no further target
                 free &= ~covers[j]
                 new = LiveTrack(self._next_id, detection, t, self._settings, self._image_size)
-                new.around = set(numbers[on[:, j]].tolist())
                 self._tracks.append(new)
                 self._next_id += 1
 

@@ -1,10 +1,9 @@
 """Fig. 6 of the paper: outdoors, several persons, the first followed until it disappears, then the next.
 
 Three persons cross the fixed view from either side; each enters before the one before has left, while foliage sways,
-clouds drift and shadows cross the ground. This project detects them by an adaptive Gaussian mixture and connected
-components, with additions for foliage (`motion`; `--set fig6_outdoors.detector=mog2` takes the plain mixture). The
-paper's method, the plain mixture and one open-loop command at a time (`experiments.paper.paper_loop`), uses the same
-calibration. The policy is the paper's, first-come.
+clouds drift and shadows cross the ground. This project detects them by `motion`; `--set fig6_outdoors.detector=mog2`
+takes the plain mixture. The paper's method, the plain mixture and one open-loop command at a time
+(`experiments.paper.paper_loop`), uses the same calibration. The policy is the paper's, first-come.
 """
 
 import dataclasses

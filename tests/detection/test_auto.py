@@ -6,7 +6,6 @@ import pytest
 
 from cotarget.config import TargetProfile
 from cotarget.detection import AutoDetector, BackgroundDetector, make_detector
-from cotarget.detection.background import LARGE
 from cotarget.pipeline import CameraRun
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
@@ -268,6 +267,87 @@ def test_a_person_is_found_as_soon_where_frames_come_twice():
     assert first(2) == pytest.approx(first(1), abs=0.1)
 
 
+def test_a_camera_that_darkens_its_picture_for_a_white_car_shows_one_target_and_no_stones():
+    """Its exposure halves while the car drives by, and a codec that follows draws the stones anew."""
+    rng, rate, size = np.random.default_rng(8), 12.5, (180, 120)
+    road = np.full((480, 640, 3), 105.0, np.float32)
+    for u, v in rng.uniform((10, 10), (630, 470), (60, 2)):
+        cv2.ellipse(road, ((u, v), (4, 3), 0), (130.0, 130.0, 130.0), cv2.FILLED)
+    car = np.clip(texture(*size, rng) * 0.3 + 170, 0, 235)
+    places = [None] * 20 + [(20 + 8 * i, 200) for i in range(55)]
+    pictures = []
+    for i, picture in enumerate(moved(road, car, places)):
+        stones = rng.normal(1.0, 0.35, road.shape[:2])[..., None]  # how a codec draws them while the exposure changes
+        ramp = np.clip(min(i - 25, 70 - i) / 20, 0, 1)
+        drawn = (
+            np.where((picture > 120) & (picture < 150), 105 + (picture - 105) * stones, picture) if ramp else picture
+        )
+        pictures.append(drawn * (1 - 0.5 * ramp))
+    tracks = follow(pictures, rate, rng)
+    middles = [np.add(place, np.array(size) / 2 - 0.5) for place in places[35:]]
+    assert np.mean([bool(on(each, middle, 20)) for each, middle in zip(tracks[35:], middles, strict=True)]) >= FOUND
+    assert len({track.id for each in tracks for track in each}) == 1
+
+
+@pytest.mark.parametrize(
+    "light", [lambda t: 1 + 0.1 * np.sin(np.pi * t), lambda t: 1 - 0.1 * t, lambda t: 1 + 0.6 * (t == 0)]
+)
+def test_a_white_bird_is_found_while_the_light_changes(light):
+    """Waves of a tenth in two seconds, an evening in fast motion, and a first image that is over-exposed."""
+    rng, rate = np.random.default_rng(9), 25.0
+    bird = np.full((5, 9, 3), 215.0)
+    places = [None] * 10 + [(40 + 3 * i, 60) for i in range(70)]
+    pictures = [
+        np.clip(picture * light(i / rate), 0, 255)
+        for i, picture in enumerate(moved(scenery((640, 480), rng), bird, places))
+    ]
+    tracks = follow(pictures, rate, rng)
+    right = [on(each, np.add(place, (4, 2)), 4) for each, place in zip(tracks, places, strict=True) if place]
+    assert np.mean([bool(each) for each in right[25:]]) >= FOUND
+
+
+@pytest.mark.parametrize("rate", [5.0, 12.5, 30.0])
+def test_a_bird_is_found_under_a_lamp_that_flickers(rate):
+    """By a tenth from frame to frame, as 50 Hz do at 30 frames a second."""
+    rng = np.random.default_rng(9)
+    bird = np.full((5, 9, 3), 40.0)
+    places = [None] * 10 + [(40 + 3 * i, 60) for i in range(80)]
+    pictures = [
+        picture * (0.95 if i % 3 else 1.05) for i, picture in enumerate(moved(scenery((640, 480), rng), bird, places))
+    ]
+    tracks = follow(pictures, rate, rng)
+    right = [on(each, np.add(place, (4, 2)), 4) for each, place in zip(tracks, places, strict=True) if place]
+    assert np.mean([bool(each) for each in right[20:]]) >= FOUND
+
+
+def test_a_lamp_that_is_switched_on_over_rough_ground_makes_no_target():
+    """Everything is 40 grey levels brighter for two seconds, as far as the sensor goes."""
+    rng, rate = np.random.default_rng(0), 25.0
+    ground = np.clip(cv2.GaussianBlur(rng.normal(95, 90, (240, 320)), (0, 0), 1.8), 0, 255)
+    ground[:100] = 150
+    ground = np.repeat(ground[..., None], 3, axis=2)
+    tracks = follow([np.clip(ground + (40 if 40 <= i < 90 else 0), 0, 255) for i in range(130)], rate, rng)
+    assert not any(tracks)
+
+
+def test_a_wall_that_is_lit_beside_someone_who_stands_does_not_hide_him():
+    rng, rate = np.random.default_rng(10), 10.0
+    background, surface = scenery((640, 480), rng), texture(80, 220, rng)
+    walk = [(40 + 12 * i, 220) for i in range(20)]
+    places = [None] * 10 + walk + [walk[-1]] * 230
+    pictures = []
+    for i, place in enumerate(places):
+        lit = background.copy()
+        if i >= 60:
+            lit[180:, 120:480] *= 1.2
+        pictures.extend(moved(lit, surface, [place]))
+    tracks, middle = follow(pictures, rate, rng), np.add(walk[-1], (39.5, 109.5))
+    standing = [on(each, middle, 15) for each in tracks[35:]]
+    assert np.mean([bool(each) for each in standing]) >= FOUND
+    assert {track.id for each in standing for track in each} == {standing[0][0].id}
+    assert standing[-1][0].size_px == pytest.approx([80, 220], abs=8)
+
+
 def test_the_place_that_a_target_has_left_is_no_target():
     """A car stood there when the background was learnt; it drives off, and leaves a ghost in the background model."""
     rng, rate = np.random.default_rng(6), 25.0
@@ -345,7 +425,7 @@ def test_a_dark_target_of_one_colour_is_found_before_a_textured_wall(size):
     rng, rate, found = np.random.default_rng(11), 25.0, []
     spots = cv2.GaussianBlur(rng.normal(0, 1, (480, 640, 1)), (0, 0), 2.0)
     wall = np.repeat((120 + 20 * spots / spots.std()).astype(np.float32)[..., None], 3, axis=2)
-    detector = BackgroundDetector(LARGE, rate)
+    detector = BackgroundDetector(rate)
     places = [None] * 20 + [(100 + 4 * i, 200) for i in range(50)]
     for i, picture in enumerate(moved(wall, np.full((*size[::-1], 3), 30.0), places)):
         image = noisy(cv2.GaussianBlur(picture, (0, 0), 0.7), rng, NOISE)
@@ -359,14 +439,14 @@ def test_a_dark_target_of_one_colour_is_found_before_a_textured_wall(size):
 @pytest.mark.parametrize("shift", [0.0, 6.0, -6.0])
 def test_a_box_at_the_images_border_is_clipped_wherever_the_camera_points(shift):
     rng, rate = np.random.default_rng(12), 25.0
-    detector = BackgroundDetector(LARGE, rate)
+    detector = BackgroundDetector(rate)
     background = scenery((480, 360), rng)
     for i in range(12):
         by = np.array([0.0 if i < 10 else shift, 0.0])
         picture = np.roll(background, round(by[0]), axis=1)
         if i >= 10:
             picture[200:260, 440:] = texture(40, 60, rng)
-        boxes = detector.subtract(Frame(noisy(picture, rng, NOISE), i / rate), shift_px=by).boxes
+        boxes = detector.detect(Frame(noisy(picture, rng, NOISE), i / rate), shift_px=by).boxes
     assert [each.clipped for each in boxes if on([each], (459.5, 229.5), 12)] == [True]
 
 
@@ -385,10 +465,10 @@ def test_the_foreground_of_a_camera_that_pans_is_not_that_of_before():
 def test_what_the_image_shows_is_learnt_beside_places_that_are_held_outside_of_it():
     """A track near the border, and a camera that has been nudged: what the image shows is learnt."""
     rng, rate = np.random.default_rng(8), 5.0
-    detector = BackgroundDetector(LARGE, rate)
+    detector = BackgroundDetector(rate)
     places = [(np.array([u, 130.0]), np.array([10.0, 60.0])) for u in (-300.0, 700.0)]
     pictures = list(moved(scenery((640, 480), rng), texture(40, 60, rng), [None] * 10 + [(320, 100)] * 200))
-    found = [detector.subtract(Frame(each.astype(np.uint8), i / rate), places) for i, each in enumerate(pictures)]
+    found = [detector.detect(Frame(each.astype(np.uint8), i / rate), places) for i, each in enumerate(pictures)]
     assert len(found[12].boxes) == 1
     assert not found[-1].boxes
     assert not found[-1].mask.any()

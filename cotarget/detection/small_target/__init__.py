@@ -5,7 +5,7 @@ both: the contrast in standard deviations of the surroundings, and the part of i
 what air, codec and camera shake change of a thing that stands. Unless the camera pans, the difference from earlier
 images is searched too, which finds a bird in front of foliage or beside a roof's edge.
 
-In rig.toml this detector is called "speck". Measurements: docs/design-notes.md.
+It is the half of `cotarget.detection.auto` that finds small targets. Measurements: docs/design-notes.md.
 """
 
 from cotarget.detection.small_target.camera_motion import CameraMotion

@@ -14,6 +14,10 @@ from cotarget.rig import Image
 AGES_S = (0.07, 0.17, 0.5, 1.0)
 # Relative tolerance of an image's age.
 AGE_TOLERANCE = 0.5
+# Relative difference of exposures from which images are not compared: a codec draws texture anew.
+EXPOSURE_TOLERANCE = 0.02
+# Time over which it is averaged, so that a lamp may flicker and a cloud pass [s].
+EXPOSURE_S = 0.5
 # Least time between two kept images [s].
 SPACING_S = 0.03
 # Search for the best match: this many pixels if the camera stands; plus this part of its shift, for parallax and
@@ -34,8 +38,9 @@ class History:
 
     def __init__(self) -> None:
         """Start without images."""
-        self._kept: deque[tuple[float, Image, Array]] = deque()
+        self._kept: deque[tuple[float, Image, Array, float]] = deque()
         self._last: Image | None = None
+        self._exposure = 1.0  # of the last image, without flicker
         self.noise = LEAST_NOISE
 
     @property
@@ -48,13 +53,14 @@ class History:
         """Whether the last image was kept: it came at least SPACING_S after the one kept before."""
         return bool(self._kept) and self._kept[-1][1] is self._last
 
-    def add(self, t: float, grey: Image, shift: Array) -> bool:
-        """Add an image; restart if its time jumped back or far ahead.
+    def add(self, t: float, grey: Image, shift: Array, exposure: float = 1.0) -> bool:
+        """Add an image; restart if its time jumped back or far ahead, and drop images of another exposure.
 
         Args:
             t: exposure time [s].
             grey: image, (H, W).
             shift: the camera's shift, (2,) [px].
+            exposure: its brightness relative to a reference.
 
         Returns:
             Whether the image differs from the last one.
@@ -72,8 +78,13 @@ class History:
             self.noise = max(LEAST_NOISE, float(usual.mean()) / MEDIAN_OF_NORMAL / np.sqrt(2.0))
         self._last = grey
         if not self._kept or t - self._kept[-1][0] >= SPACING_S:
-            self._kept.append((t, grey, shift))
-            while t - self._kept[0][0] > (1 + AGE_TOLERANCE) * AGES_S[-1]:
+            since = t - self._kept[-1][0] if self._kept else math.inf
+            self._exposure += (1 - math.exp(-since / EXPOSURE_S)) * (exposure - self._exposure)
+            self._kept.append((t, grey, shift, self._exposure))
+            while (
+                t - self._kept[0][0] > (1 + AGE_TOLERANCE) * AGES_S[-1]
+                or abs(self._kept[0][3] / self._exposure - 1) > EXPOSURE_TOLERANCE
+            ):
                 self._kept.popleft()
         return True
 
@@ -88,7 +99,7 @@ class History:
         for age in AGES_S:
             off = np.abs(ages - age)
             near = off.size and off.min() <= AGE_TOLERANCE * age
-            found.append(self._kept[int(off.argmin())][1:] if near else None)
+            found.append(self._kept[int(off.argmin())][1:3] if near else None)
         return found
 
 

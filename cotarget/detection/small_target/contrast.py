@@ -17,8 +17,8 @@ from cotarget.rig import Image
 INNER_PX = 3
 # Inner and outer side of the ring, in pixels of an image of half the size: 14 and 22 px. The target lies inside.
 GUARD_HALF_PX, OUTER_HALF_PX = 7, 11
-# Scales, for targets of up to 12 px to those of up to 400; in the difference, of up to 50.
-SCALES, SCALES_OF_DIFFERENCE = 6, 3
+# Scales, for targets of up to 12 px to those of up to 100; in the difference, of up to 50.
+SCALES, SCALES_OF_DIFFERENCE = 4, 3
 # How far the largest ring of the difference reaches, and the side of a pixel of its largest scale [px].
 REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES_OF_DIFFERENCE, 2**SCALES_OF_DIFFERENCE
 # First scale whose ring, 90 px, is so large that a sky's gradient counts.

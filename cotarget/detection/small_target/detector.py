@@ -94,8 +94,13 @@ class SmallTargetDetector:
         """
         return self.search(frame)[1]
 
-    def search(self, frame: Frame) -> tuple[list[SmallTarget], Detections]:
-        """Detect as `detect` does; also return the region of each box, in the enlarged image of a small one."""
+    def search(self, frame: Frame, exposure: float = 1.0) -> tuple[list[SmallTarget], Detections]:
+        """Detect as `detect` does; also return the region of each box, in the enlarged image of a small one.
+
+        Args:
+            frame: frame of the camera.
+            exposure: its brightness relative to a reference.
+        """
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
@@ -112,7 +117,7 @@ class SmallTargetDetector:
             self._history.clear()
             self._warm_up_s = AFTER_CUT_S
         references = self._history.references(frame.t)
-        self.repeated = not self._history.add(frame.t, grey, shift)
+        self.repeated = not self._history.add(frame.t, grey, shift, exposure)
         if self.repeated or self._history.span < self._warm_up_s:
             return [], Detections([], functools.partial(_mask, [], frame.image.shape, times))
         self._warm_up_s = WARM_UP_S

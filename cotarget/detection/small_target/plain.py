@@ -34,8 +34,10 @@ def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
     height, width = grey.shape
     unit = max(1, round(FINE_PART * width))
     coarse = max(1, round(COARSE_PART * width))
-    fine = cv2.resize(grey, (width // unit, height // unit), interpolation=cv2.INTER_AREA)
-    small = cv2.resize(grey, (width // coarse, height // coarse), interpolation=cv2.INTER_AREA)
+    fine, small = (
+        cv2.resize(grey, (max(1, width // side), max(1, height // side)), interpolation=cv2.INTER_AREA)
+        for side in (unit, coarse)
+    )
     side = 2 * round(WINDOW_PART * small.shape[1] / 2) + 1
     ground = cv2.resize(cv2.blur(cv2.medianBlur(small, side), (5, 5)), fine.shape[::-1], interpolation=cv2.INTER_LINEAR)
     sharp = cv2.absdiff(fine, ground)

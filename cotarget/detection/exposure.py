@@ -1,0 +1,49 @@
+"""Measure what a camera's automatic exposure does, so that it is not taken for a change of the scene."""
+
+import math
+
+import cv2
+import numpy as np
+
+from cotarget.geometry import Array
+from cotarget.rig import Frame
+
+# Cells along width and height in which brightness is compared.
+CELLS = (32, 24)
+# Deviation of a cell from the common change up to which it agrees, and least part of the cells that do; and the range
+# of the change. Beyond these, the picture has changed and not the exposure.
+AGREEMENT, LEAST_PART = 0.1, 0.5
+DARKEST, BRIGHTEST = 1 / 3, 1.5
+# Time constant with which the reference follows, as long as the background's memory; and time for which a picture must
+# have changed to be the new reference, which a flash has not [s].
+FOLLOWS_S, CHANGED_S = 20.0, 0.2
+
+
+class Exposure:
+    """Measures the brightness of images relative to that of the last seconds."""
+
+    def __init__(self) -> None:
+        """Start without a reference."""
+        self._reference: Array | None = None
+        self._t = 0.0
+        self._changed_t: float | None = None  # since when the picture is another
+
+    def measure(self, frame: Frame) -> float:
+        """Return a frame's brightness over that of the reference; 1 where the picture has changed.
+
+        It is the median ratio over cells of the image, so that a target may cover nearly half of it.
+        """
+        cells = cv2.cvtColor(cv2.resize(frame.image, CELLS, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY) + 1.0
+        if self._reference is None:
+            self._reference, self._t = cells, frame.t
+        ratio = cells / self._reference
+        change = float(np.median(ratio))
+        since, self._t = max(0.0, frame.t - self._t), frame.t
+        if np.mean(np.abs(ratio / change - 1) < AGREEMENT) < LEAST_PART or not DARKEST < change < BRIGHTEST:
+            self._changed_t = frame.t if self._changed_t is None else self._changed_t
+            if frame.t - self._changed_t >= CHANGED_S:
+                self._reference, self._changed_t = cells, None
+            return 1.0
+        self._changed_t = None
+        self._reference = self._reference + (1 - math.exp(-since / FOLLOWS_S)) * (cells - self._reference)
+        return change
