@@ -75,5 +75,5 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 SETTINGS = DeadZoneSettings()
 # Without correction from the zoom view, which takes a third of the time.
-QUICK = dataclasses.replace(SETTINGS, seeds=3, targets=("person",), seconds=6.0, calibrated=False, closed_loop=False)
+QUICK = dataclasses.replace(SETTINGS, targets=("person",), seconds=6.0, calibrated=False, closed_loop=False)
 COST_S = 180.0

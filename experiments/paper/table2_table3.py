@@ -99,7 +99,7 @@ def row_of(seed: int, of: str, name: str, found: float, sigma: float, true: floa
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Give each parameter's truth, mean and rms over the seeds, and the consistency of sigma."""
+    """Give each parameter's truth, mean, rms error and median sigma over the seeds, and the consistency of sigma."""
     found: dict[str, Any] = {}
     for of, mine in grouped(rows, "of").items():
         found[of] = {name: _parameter(each) for name, each in grouped(mine, "parameter").items()}
@@ -113,7 +113,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _parameter(rows: Sequence[Row]) -> dict[str, float]:
-    sigma = rms(row["sigma"] for row in rows)
+    sigma = float(np.median([row["sigma"] for row in rows]))
     errors = [row["error"] for row in rows]
     return {
         "true": rows[0]["true"],
@@ -121,7 +121,6 @@ def _parameter(rows: Sequence[Row]) -> dict[str, float]:
         "first_sigma": rows[0]["sigma"],
         "found": float(np.mean([row["found"] for row in rows])),
         "sigma": sigma,
-        "usual_sigma": float(np.median([row["sigma"] for row in rows])),
         "error": rms(errors),
         "least_error": min(errors),
         "largest_error": max(errors),
@@ -138,7 +137,7 @@ def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
     kinds = {"focal length, px": LENS[:2], "centre, px": LENS[2:], "translation, mm": PLACES, "rotation, deg": TURNS}
     return {
         of: {
-            f"sigma of {kind}": max(parameters[name]["usual_sigma"] for name in names)
+            f"sigma of {kind}": max(parameters[name]["sigma"] for name in names)
             for kind, names in kinds.items()
             if names[0] in parameters
         }
