@@ -116,5 +116,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = HoldSettings()
-QUICK = dataclasses.replace(SETTINGS, seconds=3.0, calibrated=False)
+QUICK = dataclasses.replace(SETTINGS, seconds=5.0, calibrated=False)
 COST_S = 150.0
