@@ -242,7 +242,7 @@ def fuse(
     outlined: Sequence[bool],
     followed: Sequence[bool],
     large: Sequence[Detection],
-    like: Callable[[Detection], float] = lambda _: 1.0,
+    like: Callable[[Detection], float],
 ) -> list[Detection]:
     """Make one list of small and large targets, best first.
 

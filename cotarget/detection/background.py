@@ -11,12 +11,19 @@ from functools import partial
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, box_detection, check_size, flood, is_clipped, moved, pieces
+from cotarget.detection.base import (
+    FOREGROUND,
+    Detections,
+    box_detection,
+    check_size,
+    flood,
+    is_clipped,
+    moved,
+    pieces,
+)
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image
 
-# In the mixture's mask, in which a shadow is 127.
-FOREGROUND = 255
 # Shift of the scene before a camera that stands [px].
 STANDING = np.zeros(2)
 # Images are halved until they are at most this wide [px]; the lengths below are in pixels of the result.
@@ -206,8 +213,7 @@ class BackgroundDetector:
         there = np.flatnonzero(mask != 0)
         now, before = (each.reshape(-1, 3)[there].astype(np.float32) for each in (image, self._background()))
         light = np.einsum("ij,ij->i", now, before) / np.maximum(np.einsum("ij,ij->i", before, before), 1.0)
-        light = np.maximum(light, 1.0)  # of 1, what the background has become already
-        same = (np.abs(now - light[:, None] * before) < MARGIN).all(axis=1) & (light < BRIGHTEST)
+        same = (np.abs(now - light[:, None] * before) < MARGIN).all(axis=1) & (light > 1.0) & (light < BRIGHTEST)
         free = mask.copy()
         lit.ravel()[there[same]] = FOREGROUND
         for box in held:

@@ -23,6 +23,8 @@ from cotarget.rig import Detection, Frame, Image
 if TYPE_CHECKING:
     from cotarget.tracking.track import Track
 
+# Foreground in a mask; in that of OpenCV's mixture, a shadow is 127.
+FOREGROUND = 255
 # Largest part of foreground that may be targets; beyond it, the light or the camera has changed.
 MOST_FOREGROUND = 0.45
 

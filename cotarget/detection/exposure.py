@@ -12,7 +12,7 @@ from cotarget.rig import Frame
 CELLS = (32, 24)
 # Deviation of a cell from the common change up to which it agrees, and least part of the cells that do; and the range
 # of the change. Beyond these, the picture has changed and not the exposure.
-AGREEMENT, LEAST_PART = 0.1, 0.5
+AGREEMENT, FEWEST = 0.1, 0.5
 DARKEST, BRIGHTEST = 1 / 3, 1.5
 # Time constant with which the reference follows, as long as the background's memory; and time for which a picture must
 # have changed to be the new reference, which a flash has not [s].
@@ -39,7 +39,7 @@ class Exposure:
         ratio = cells / self._reference
         change = float(np.median(ratio))
         since, self._t = max(0.0, frame.t - self._t), frame.t
-        if np.mean(np.abs(ratio / change - 1) < AGREEMENT) < LEAST_PART or not DARKEST < change < BRIGHTEST:
+        if np.mean(np.abs(ratio / change - 1) < AGREEMENT) < FEWEST or not DARKEST < change < BRIGHTEST:
             self._changed_t = frame.t if self._changed_t is None else self._changed_t
             if frame.t - self._changed_t >= CHANGED_S:
                 self._reference, self._changed_t = cells, None

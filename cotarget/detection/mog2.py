@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, box_detection, check_size, flood, pieces
+from cotarget.detection.base import FOREGROUND, Detections, box_detection, check_size, flood, pieces
 from cotarget.rig import Frame
 
 if TYPE_CHECKING:
     from cotarget.tracking.track import Track
 
-FOREGROUND = 255  # in the mixture's mask, in which a shadow is 127
 # Memory of OpenCV's default mixture, 120 frames at 30 a second, and time that is learnt before a detection [s].
 HISTORY_S, WARM_UP_S = 4.0, 0.5
 # Squared distance to the background, in variances, from which a pixel is foreground.
@@ -77,9 +76,8 @@ class Mog2Detector:
             return Detections([], lambda: mask)
         found = []
         for x, y, w, h in pieces(mask, self._grouping.bridge_px):
-            inside = mask[
-                y : y + h, x : x + w
-            ]  # gaps are bridged in the piece; the box is that of the mask's own pixels
+            # The component's gaps are bridged, so its box is that of the mask's own pixels.
+            inside = mask[y : y + h, x : x + w]
             area, least = cv2.countNonZero(inside), self._grouping.smallest_area_px
             if area >= least:
                 dx, dy, w, h = cv2.boundingRect(inside)

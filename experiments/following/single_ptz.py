@@ -179,13 +179,9 @@ class Shaken:
 
 
 def config_of(name: str, seed: int) -> RigConfig:
-    """Configure the field without clutter, which ground-truth detections ignore, and detection by appearance."""
+    """Configure the field without clutter, which ground-truth detections ignore."""
     config = hold_config(name, seed)
-    config = replace(config, sim=replace(config.sim, effects=replace(config.sim.effects, clutter=False)))
-    target = config.target(name)
-    # With `motion`, a target must move some way before it is confirmed, which a single camera cannot measure.
-    looks = target if target.matcher == "box" else replace(target, detector="speck")
-    return replace(config, targets={**config.targets, name: looks})
+    return replace(config, sim=replace(config.sim, effects=replace(config.sim.effects, clutter=False)))
 
 
 def held(way: str, name: str, seed: int, seconds: float, miss: float) -> list[Judged]:
