@@ -118,7 +118,7 @@ def _run(
     with_target = 0
     for frame in film:
         camera.track(frame)
-        tracks = [track for track in camera.tracks if track.confirmed]
+        tracks = [track for track in camera.tracks if track.reported]
         for track in tracks:
             write_row(_row(film.number, frame.t, track, film.size))
         numbers.update(track.id for track in tracks)

@@ -158,11 +158,11 @@ def captioned(image: Image, text: str) -> Image:
 
 
 def draw_wide(step: Step, factor: float = 1.0) -> Image:
-    """Draw the fixed camera's frame, enlarged by a factor, with boxes of confirmed tracks; the followed one differs."""
+    """Draw the fixed camera's frame, enlarged by a factor, with boxes of reported tracks; the followed one differs."""
     image = _enlarged(step.fixed.image, factor)
     draw_ignored(image, step.ignored)
     for track in step.tracks:
-        if track.confirmed:
+        if track.reported:
             followed = step.target is not None and track.id == step.target.id
             center = factor * (track.center_px + 0.5) - 0.5
             draw_box(

@@ -261,9 +261,9 @@ def decodes(frame: Frame, outline: Silhouette | None, marker: int) -> bool:
 
 
 def off_target(tracks: Iterable[Track], outlines: Iterable[Silhouette | None]) -> list[int]:
-    """List the ids of confirmed tracks that are on no target, by the true outlines in the fixed frame."""
+    """List the ids of reported tracks that are on no target, by the true outlines in the fixed frame."""
     found = [outline for outline in outlines if outline is not None]
-    return [track.id for track in tracks if track.confirmed and not any(_is_on(track, each) for each in found)]
+    return [track.id for track in tracks if track.reported and not any(_is_on(track, each) for each in found)]
 
 
 def on_target(tracks: Iterable[Track], outlines: Mapping[str, Silhouette | None]) -> list[tuple[int, str]]:

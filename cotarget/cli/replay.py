@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 class TracksByImage:
-    """The confirmed tracks of a replay, with the numbers of the recorded images, which are given by exposure time."""
+    """The reported tracks of a replay, with the numbers of the recorded images, which are given by exposure time."""
 
     warning = ""
 
@@ -85,7 +85,5 @@ class TracksByImage:
 
         frame = self._numbers[step.fixed.t]
         self.tracks += [
-            Tracked(each.center_px, each.size_px, frame, step.fixed.t, each.id)
-            for each in step.tracks
-            if each.confirmed
+            Tracked(each.center_px, each.size_px, frame, step.fixed.t, each.id) for each in step.tracks if each.reported
         ]

@@ -54,7 +54,7 @@ HELD_S = 60.0
 HELD_MARGIN, HELD_PART = 0.2, 2 / 640
 # Logarithm of width over height: standard deviation of targets about the expected one, as persons who walk have, and of
 # anything about a square; and part of the targets that may have any shape, such as a person who lies.
-SHAPE_SIGMA, OTHER_SIGMA, OTHER_PART = 0.5, 1.0, 0.05
+SHAPE_SIGMA, OTHER_SIGMA, OTHER_PART = 0.5, 1.0, 0.2
 # Clutter: number of cells along the image's width, memory [s], and the usual score that halves a target's odds.
 CELLS, CLUTTER_S, CLUTTER_EVEN = 80, 10.0, 0.03
 # Largest weight of one image in the clutter map: the first after a pause does not empty it.

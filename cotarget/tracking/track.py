@@ -261,9 +261,10 @@ class TrackingSettings:
         travel_s: window of that travel [s].
         confirm_score: least average score of a confirmed track, the last detections weighted most; 0 for any. With
             `confirm_travel` too, half of it is enough for a track that has travelled.
-        start_score: a detection with a lower score only continues a confirmed track.
+        start_score: a detection with a lower score neither begins nor prolongs a track; a confirmed one follows it for
+            `lose_s`.
         score_s: time constant of the average score [s]; a new track begins at 0.
-        lose_s: time without a detection after which a confirmed track ends [s]; its age if that is less.
+        lose_s: time without such a detection after which a confirmed track ends [s]; its age if that is less.
         drop_s: time without a detection after which an unconfirmed track ends [s].
         size_s: window of the size's median, some two wing beats [s].
         trend: whether the size follows a target that grows or shrinks. Wings look as if it did.
@@ -323,7 +324,7 @@ BY_MOTION: Mapping[str, Mapping[str, float]] = {
     "flying": {"noise_of_size": 0.2, "process_noise": 18750.0, "trend": False},
     "general": {},
 }
-AUTO: Mapping[str, float] = {"confirm_score": 0.5, "confirm_travel": 0.25, "least_travel": 0.03, "start_score": 0.02}
+AUTO: Mapping[str, float] = {"confirm_score": 0.5, "confirm_travel": 0.25, "least_travel": 0.03, "start_score": 0.05}
 BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
     "colour": {"noise_px": 0.2, "noise_of_size": 0.01},
     "auto": AUTO,
@@ -379,6 +380,12 @@ class Track:
     seen_t: float = -math.inf
 
     @property
+    def reported(self) -> bool:
+        """Whether it is confirmed, and seen or predicted to within its box, by one standard deviation."""
+        variance = max(self.covariance[0, 0], self.covariance[1, 1])
+        return self.confirmed and (not self.missed or bool(variance <= (self.size_px.max() / 2) ** 2))
+
+    @property
     def shape(self) -> float:
         """Width over height of its usual box."""
         width, height = self.size_px.tolist()
@@ -398,7 +405,7 @@ class LiveTrack:
     ) -> None:
         self.number = number
         self.settings = settings
-        self.t = self.born = self.seen = t
+        self.t = self.born = self.seen = self.believed = t  # believed: by a detection of `start_score`
         self.detection, self.shared = detection, False
         self.hits = 1
         self.missed = 0
@@ -456,7 +463,7 @@ class LiveTrack:
         else:
             self._axes = self._begin(detection)
             self._whole = not detection.clipped
-        self._found()
+        self._found(detection.score)
         self._add_box(detection)
         self.detection, self.shared = detection, False
         self.hits += 1
@@ -470,7 +477,7 @@ class LiveTrack:
         room = room_inside(detection.size_px, self.size)
         inside = np.clip(self.center, detection.center_px - room, detection.center_px + room)
         self._measure(inside.tolist(), ((self.size / 4) ** 2 + room**2).tolist())
-        self._found()
+        self._found(detection.score)
         self.detection, self.shared = detection, True
 
     @property
@@ -487,7 +494,7 @@ class LiveTrack:
             (u, v), (width, height) = self.center, image_size
             if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
                 return True
-        return self.t - self.seen > self.timeout_s
+        return self.t - self.believed > self.timeout_s
 
     def track(self) -> Track:
         """Give the state as a frozen `Track`."""
@@ -570,9 +577,11 @@ class LiveTrack:
         for axis, at, var in zip(self._axes, center, variance, strict=True):
             axis.correct(at, var)
 
-    def _found(self) -> None:
-        """Note that this frame has a detection."""
+    def _found(self, score: float) -> None:
+        """Note that this frame has a detection with a score."""
         self.seen = self.t
+        if score >= self.settings.start_score:
+            self.believed = self.t
         self.missed = 0
         self.after_cut = False
 

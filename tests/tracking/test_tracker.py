@@ -180,6 +180,30 @@ def test_track_ends_after_its_time_and_its_number_is_not_used_again():
     assert [t.id for t in tracks[-1]] == [2]
 
 
+@pytest.mark.parametrize(("side", "most"), [(4.0, 2), (20.0, 8)])
+def test_a_prediction_is_reported_while_it_is_known_to_within_the_box(side, most):
+    """A prediction's deviation is the square root of q t^3 / 3 at least: 2 px after 0.12 s, 10 px after 0.35 s."""
+    tracker = Tracker(PLAIN, SIZE)
+    for t in np.arange(30) / RATE:
+        (track,) = tracker.update([seen(100 + 100 * t, 200, side, side)], t)
+    assert track.reported
+    reported = [tracker.update([], (30 + i) / RATE)[0].reported for i in range(18)]
+    assert 0 < sum(reported) <= most
+    assert reported == sorted(reported, reverse=True)
+    (track,) = tracker.update([seen(100 + 100 * 48 / RATE, 200, side, side)], 48 / RATE)
+    assert (track.id, track.reported) == (1, True)
+
+
+def test_what_is_no_more_believed_prolongs_no_track():
+    """A bird has gone behind a tree, and twigs move at its place: they are followed for a moment, as the bird may be."""
+    tracker = Tracker(replace(PLAIN, start_score=0.05), SIZE)
+    run(tracker, np.arange(30) / RATE, ((100, 200), (0, 0)))
+    with_twigs = [tracker.update([seen(100, 200, score=0.03)], (30 + i) / RATE) for i in range(60)]
+    alive_s = sum(map(bool, with_twigs)) / RATE
+    assert alive_s == pytest.approx(PLAIN.lose_s, abs=2 / RATE)
+    assert numbers(with_twigs) == {1}
+
+
 @pytest.mark.parametrize("gap_s", [1.0, 2.0, 5.0, 60.0, 3600.0])
 @pytest.mark.parametrize("frames", [1, 3, 50])
 def test_what_appears_after_a_gap_between_frames_is_another_target(gap_s, frames):
