@@ -195,7 +195,7 @@ def test_a_prediction_is_reported_while_it_is_known_to_within_the_box(side, most
 
 
 def test_what_is_no_more_believed_prolongs_no_track():
-    """A bird has gone behind a tree, and twigs move at its place: they are followed for a moment, as the bird may be."""
+    """A bird has gone behind a tree, and twigs move at its place: they are followed for a moment, as it may be."""
     tracker = Tracker(replace(PLAIN, start_score=0.05), SIZE)
     run(tracker, np.arange(30) / RATE, ((100, 200), (0, 0)))
     with_twigs = [tracker.update([seen(100, 200, score=0.03)], (30 + i) / RATE) for i in range(60)]
