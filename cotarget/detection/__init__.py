@@ -11,24 +11,20 @@ import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.detection.auto import AutoDetector
-from cotarget.detection.background import BackgroundDetector
 from cotarget.detection.base import Detections, Detector, ExternalDetector
 from cotarget.detection.color_template import ColorTemplateDetector
 from cotarget.detection.mog2 import FLYING, ON_THE_GROUND, Mog2Detector
 from cotarget.detection.network import Network
-from cotarget.detection.small_target import SmallTargetDetector
 from cotarget.errors import ConfigError
 from cotarget.plugins import is_own, load, reporting
 
 __all__ = [
     "AutoDetector",
-    "BackgroundDetector",
     "ColorTemplateDetector",
     "Detections",
     "Detector",
     "ExternalDetector",
     "Mog2Detector",
-    "SmallTargetDetector",
     "make_detector",
     "make_network",
 ]

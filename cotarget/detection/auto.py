@@ -1,7 +1,7 @@
 """Detect what moves or stands out, from 3 px to half the image's width, of any kind.
 
-Two detectors search each image. `SmallTargetDetector` finds by contrast and change, and outlines what stands before a
-plain background to the pixel. `BackgroundDetector`, on an image of reduced size, finds large targets of many colours,
+Two parts search each image. `SmallTargetFinder` finds by contrast and change, and outlines what stands before a
+plain background to the pixel. `LargeTargetFinder`, on an image of reduced size, finds large targets of many colours,
 such as people, as a whole. `fuse` makes one list of both.
 
 The score of a small target falls where something like it is seen most of the time: a twig, a swinging tape. The
@@ -20,18 +20,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.detection.background import LEAST_PART, WIDE, BackgroundDetector
-from cotarget.detection.base import Detections
+from cotarget.detection.background import LEAST_PART, WIDE, LargeTargetFinder
+from cotarget.detection.base import Detections, SizeCheck
 from cotarget.detection.exposure import Exposure
-from cotarget.detection.small_target import WEIGHTS, SmallTarget, SmallTargetDetector, Weights
+from cotarget.detection.small_target import WEIGHTS, SmallTarget, SmallTargetFinder, Weights
 from cotarget.geometry import Array, intersection_areas
 from cotarget.rig import Detection, Frame, Image
 
 if TYPE_CHECKING:
     from cotarget.tracking.track import Track
 
-# Least score of a small target. The tracker begins no track with so little; a target that hovers before trees keeps it.
-LEAST_SCORE = 0.005
 # In parts of the image's width: most that a camera shakes, more is a pan; shift at which the background is learnt
 # again, because too much of it is out of view; and least shift that counts.
 SHAKE_PART, VIEW_PART, QUIET_PART = 3 / 640, 0.1, 0.5 / 640
@@ -83,8 +81,9 @@ class AutoDetector:
             large: whether to search for large ones by a background model, and not only before a plain background.
         """
         self._shape, self._with_small, self._with_large = shape, small, large
-        self._small = SmallTargetDetector(LEAST_SCORE, weights)
-        self._large = BackgroundDetector(rate_hz, upright=shape is not None and shape < WIDE)
+        self._small = SmallTargetFinder(weights)
+        self._large = LargeTargetFinder(rate_hz, upright=shape is not None and shape < WIDE)
+        self._size = SizeCheck()
         self._clutter = Clutter()
         self._exposure = Exposure()
         self._apart: list[Detection] = []  # small targets that are no part of a large one, best first
@@ -101,10 +100,11 @@ class AutoDetector:
         Raises:
             CotargetError: the image's size changed.
         """
+        self._size.check(frame.image)
         width = frame.image.shape[1]
         exposure = self._exposure.measure(frame)
         self._hold(held, width)
-        targets, contrast = self._small.search(frame, exposure)
+        targets, contrast = self._small.find(frame, exposure)
         steady, shift_px = self._register(frame.t, width)
         boxes: list[Detection] = []
         if not self._small.repeated:  # a repeated frame says nothing of where targets usually are
@@ -126,7 +126,7 @@ class AutoDetector:
         width = frame.image.shape[1]
         found = small = self._clutter.weigh(boxes, frame.t, width, self._held)
         if shift_px is not None and self._with_large:
-            self._background = self._large.detect(frame, self._held, shift_px, exposure)
+            self._background = self._large.find(frame, self._held, shift_px, exposure)
             outlined = [target.whole or target.beside <= PLAIN for target in targets]
             followed = self._are_followed(small, frame.t, width)
             found = fuse(small, outlined, followed, self._background.boxes, self._likeness)

@@ -1,4 +1,4 @@
-"""Detect large targets by an adaptive Gaussian mixture of the background, in an image of reduced size.
+"""Find large targets by an adaptive Gaussian mixture of the background, in an image of reduced size.
 
 Shadows and lit ground are no part of a target, clouds and places that a target has left are none, and what the tracker
 holds is not learnt. The reasons for the numbers: docs/design-notes.md.
@@ -15,7 +15,6 @@ from cotarget.detection.base import (
     FOREGROUND,
     Detections,
     box_detection,
-    check_size,
     flood,
     is_clipped,
     moved,
@@ -60,11 +59,11 @@ BRIGHTEST, FEW, LIT = 1.5, 0.01, 0.8
 MARGIN = 15
 
 
-class BackgroundDetector:
-    """Detect what differs from an adaptive Gaussian mixture of the background (Zivkovic 2004)."""
+class LargeTargetFinder:
+    """Find what differs from an adaptive Gaussian mixture of the background (Zivkovic 2004)."""
 
     def __init__(self, rate_hz: float, upright: bool = False) -> None:
-        """Create a detector without a background.
+        """Start without a background.
 
         Args:
             rate_hz: nominal frame rate, for frames whose times do not increase [Hz].
@@ -80,28 +79,22 @@ class BackgroundDetector:
         self._learnt = 0.0
         self._since: float | None = None  # time since which foreground fills the image
         self._known: tuple[Image, float] | None = None  # background image, and when it was read from the mixture
-        self._shape: tuple[int, ...] | None = None
 
-    def detect(
+    def find(
         self,
         frame: Frame,
         places: Sequence[tuple[Array, Array]] = (),
         shift_px: Array = STANDING,
         exposure: float = 1.0,
     ) -> Detections:
-        """Detect large targets, the largest first.
+        """Find large targets, the largest first.
 
         Args:
             frame: frame of the camera.
             places: centre and size of places whose background is not learnt, (2,) each [px].
             shift_px: shift of the scene since the background was begun (du, dv) [px], (2,).
             exposure: relative brightness of the image, which is undone.
-
-        Raises:
-            CotargetError: the image's size changed.
         """
-        check_size(self._shape, frame.image)
-        self._shape = frame.image.shape
         image, factor = frame.image, 1
         while image.shape[1] > WIDEST_PX:
             image = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -115,17 +115,25 @@ def pieces(mask: Image, bridge_px: tuple[int, int]) -> list[Sequence[int]]:
     return [cv2.boundingRect(contour) for contour in contours]
 
 
-def check_size(shape: tuple[int, ...] | None, image: Image) -> None:
-    """Refuse an image whose shape differs from that of the last one.
+class SizeCheck:
+    """Refuse images of another size than the first one."""
 
-    Raises:
-        CotargetError: the image's size changed.
-    """
-    if shape is not None and image.shape != shape:
-        raise CotargetError(
-            f"the image's size changed from {shape[1]}x{shape[0]} to {image.shape[1]}x{image.shape[0]}; "
-            "the detector needs one camera with one size"
-        )
+    def __init__(self) -> None:
+        """Start without an image."""
+        self._shape: tuple[int, ...] | None = None
+
+    def check(self, image: Image) -> None:
+        """Check the next image.
+
+        Raises:
+            CotargetError: the image's size changed.
+        """
+        shape = self._shape = self._shape or image.shape
+        if image.shape != shape:
+            raise CotargetError(
+                f"the image's size changed from {shape[1]}x{shape[0]} to {image.shape[1]}x{image.shape[0]}; "
+                "the detector needs one camera with one size"
+            )
 
 
 # External detectors
@@ -154,7 +162,7 @@ class ExternalDetector:
                 3 and row 5 is (3, 5, 1, 1).
         """
         self._find = find
-        self._shape: tuple[int, ...] | None = None
+        self._size = SizeCheck()
 
     def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
         """Detect what the function finds; boxes are cut to the image.
@@ -162,8 +170,7 @@ class ExternalDetector:
         Raises:
             CotargetError: the image's size changed, or the function did not return boxes.
         """
-        check_size(self._shape, frame.image)
-        self._shape = frame.image.shape
+        self._size.check(frame.image)
         size = np.array(frame.image.shape[1::-1], dtype=float)
         found = []
         for box in _listed(self._find(frame.image)):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, box_detection, check_size
+from cotarget.detection.base import Detections, SizeCheck, box_detection
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image
@@ -177,7 +177,7 @@ class ColorTemplateDetector:
         self._look = _normalised(cv2.resize(framed, LOOK, interpolation=cv2.INTER_AREA))
         tests = np.vstack([self._along, HUE_TANGENT * self._along - across, HUE_TANGENT * self._along + across])
         self._tests = tests * CHROMA_BYTE / strong
-        self._shape: tuple[int, ...] | None = None
+        self._size = SizeCheck()
 
     def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
         """Detect targets of the template's colour and shape.
@@ -185,8 +185,7 @@ class ColorTemplateDetector:
         Raises:
             CotargetError: the image's size changed.
         """
-        check_size(self._shape, frame.image)
-        self._shape = frame.image.shape
+        self._size.check(frame.image)
         tests = cv2.transform(frame.image, self._tests)  # saturates at 0, so a wrong hue fails one of the last two
         mask = np.asarray(cv2.inRange(tests, (LEAST_WEIGHT * CHROMA_BYTE, 1, 1), (255, 255, 255)), dtype=np.uint8)
         joined = cv2.dilate(mask, np.ones((3, 3), np.uint8))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from cotarget.detection.base import FOREGROUND, Detections, box_detection, check_size, flood, pieces
+from cotarget.detection.base import FOREGROUND, Detections, SizeCheck, box_detection, flood, pieces
 from cotarget.rig import Frame
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Mog2Detector:
             history=max(1, round(HISTORY_S * rate_hz)), varThreshold=THRESHOLD, detectShadows=grouping.shadows
         )
         self._unlearnt = round(WARM_UP_S * rate_hz)  # frames
-        self._shape: tuple[int, ...] | None = None
+        self._size = SizeCheck()
 
     def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
         """Detect moving targets, largest first; the background is learnt everywhere.
@@ -63,8 +63,7 @@ class Mog2Detector:
         Raises:
             CotargetError: the image's size changed.
         """
-        check_size(self._shape, frame.image)
-        self._shape = frame.image.shape
+        self._size.check(frame.image)
         mask = np.asarray(self._model.apply(frame.image), dtype=np.uint8)
         if self._grouping.shadows:
             mask = np.asarray(cv2.threshold(mask, FOREGROUND - 1, FOREGROUND, cv2.THRESH_BINARY)[1], dtype=np.uint8)

@@ -19,8 +19,8 @@ from scipy.optimize import minimize
 from scipy.special import expit, xlogy
 
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import AutoDetector, SmallTargetDetector
-from cotarget.detection.small_target import WEIGHTS, Weights, evidence
+from cotarget.detection import AutoDetector
+from cotarget.detection.small_target import WEIGHTS, SmallTargetFinder, Weights, evidence
 from cotarget.files import read_table
 from cotarget.geometry import Array
 from cotarget.track_metrics import LEARNING_FRAMES, Box, Criterion
@@ -92,9 +92,9 @@ def _searched(film: LabelledFilm, name: str, weights: Weights) -> Row:
 
 def examined(film: LabelledFilm) -> tuple[Array, Array]:
     """Give the evidence of each region examined in labelled frames, (n, 3), and whether it is on a label, (n,)."""
-    detector, seen, on = SmallTargetDetector(0.0), list[Any](), list[bool]()
+    finder, seen, on = SmallTargetFinder(least_score=0.0), list[Any](), list[bool]()
     for index, frame in enumerate(film.frames):
-        targets, found = detector.search(frame)
+        targets, found = finder.find(frame)
         if index < LEARNING_FRAMES or not film.labels.get(index):
             continue
         for target, detection in zip(targets, found.boxes, strict=True):

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from cotarget.config import TargetProfile
-from cotarget.detection import AutoDetector, BackgroundDetector, make_detector
+from cotarget.detection import AutoDetector, make_detector
+from cotarget.detection.background import LargeTargetFinder
 from cotarget.pipeline import CameraRun
 from cotarget.rig import Frame
 from cotarget.tracking.track import tracking_settings
@@ -423,11 +424,11 @@ def test_a_dark_target_of_one_colour_is_found_before_a_textured_wall(size):
     rng, rate, found = np.random.default_rng(11), 25.0, []
     spots = cv2.GaussianBlur(rng.normal(0, 1, (480, 640, 1)), (0, 0), 2.0)
     wall = np.repeat((120 + 20 * spots / spots.std()).astype(np.float32)[..., None], 3, axis=2)
-    detector = BackgroundDetector(rate)
+    finder = LargeTargetFinder(rate)
     places = [None] * 20 + [(100 + 4 * i, 200) for i in range(50)]
     for i, picture in enumerate(moved(wall, np.full((*size[::-1], 3), 30.0), places)):
         image = noisy(cv2.GaussianBlur(picture, (0, 0), 0.7), rng, NOISE)
-        boxes = detector.detect(Frame(image, i / rate)).boxes
+        boxes = finder.find(Frame(image, i / rate)).boxes
         if i >= 26:
             middle = np.add(places[i], np.array(size) / 2 - 0.5)
             found.append(any(np.abs(each.center_px - middle).max() < 6 for each in boxes))
@@ -437,14 +438,14 @@ def test_a_dark_target_of_one_colour_is_found_before_a_textured_wall(size):
 @pytest.mark.parametrize("shift", [0.0, 6.0, -6.0])
 def test_a_box_at_the_images_border_is_clipped_wherever_the_camera_points(shift):
     rng, rate = np.random.default_rng(12), 25.0
-    detector = BackgroundDetector(rate)
+    finder = LargeTargetFinder(rate)
     background = scenery((480, 360), rng)
     for i in range(12):
         by = np.array([0.0 if i < 10 else shift, 0.0])
         picture = np.roll(background, round(by[0]), axis=1)
         if i >= 10:
             picture[200:260, 440:] = texture(40, 60, rng)
-        boxes = detector.detect(Frame(noisy(picture, rng, NOISE), i / rate), shift_px=by).boxes
+        boxes = finder.find(Frame(noisy(picture, rng, NOISE), i / rate), shift_px=by).boxes
     assert [each.clipped for each in boxes if on([each], (459.5, 229.5), 12)] == [True]
 
 
@@ -463,10 +464,10 @@ def test_the_foreground_of_a_camera_that_pans_is_not_that_of_before():
 def test_what_the_image_shows_is_learnt_beside_places_that_are_held_outside_of_it():
     """A track near the border, and a camera that has been nudged: what the image shows is learnt."""
     rng, rate = np.random.default_rng(8), 5.0
-    detector = BackgroundDetector(rate)
+    finder = LargeTargetFinder(rate)
     places = [(np.array([u, 130.0]), np.array([10.0, 60.0])) for u in (-300.0, 700.0)]
     pictures = list(moved(scenery((640, 480), rng), texture(40, 60, rng), [None] * 10 + [(320, 100)] * 200))
-    found = [detector.detect(Frame(each.astype(np.uint8), i / rate), places) for i, each in enumerate(pictures)]
+    found = [finder.find(Frame(each.astype(np.uint8), i / rate), places) for i, each in enumerate(pictures)]
     assert len(found[12].boxes) == 1
     assert not found[-1].boxes
     assert not found[-1].mask.any()

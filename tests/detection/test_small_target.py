@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import SmallTargetDetector
+from cotarget.detection import make_detector
 from cotarget.detection.small_target import CameraMotion, find_small_targets
 from cotarget.errors import CotargetError
 from cotarget.rig import Frame
@@ -48,7 +48,7 @@ def photograph(picture, rng):
 
 
 def watch(pictures, detector=None):
-    detector = detector or SmallTargetDetector()
+    detector = detector or make_detector(SPECK, RATE)
     return [detector.detect(Frame(picture, i / RATE)).boxes for i, picture in enumerate(pictures)]
 
 
@@ -188,7 +188,7 @@ def test_a_bird_in_front_of_rough_ground_is_found_by_what_it_does_to_the_picture
 def test_a_bird_in_front_of_rough_ground_is_found_at_a_hundred_frames_a_second():
     """What is usual at a place is learnt by the time, and not by the number of frames."""
     rng, rate = np.random.default_rng(8), 100.0
-    ground, detector, on = landscape(rng), SmallTargetDetector(), []
+    ground, detector, on = landscape(rng), make_detector(SPECK, RATE), []
     tracker = Tracker(tracking_settings(SPECK), (WIDTH, HEIGHT))
     for i in range(180):
         picture, at = ground.copy(), (30 + 40 * i / rate, 205)
@@ -210,7 +210,7 @@ def test_a_bird_of_a_pixel_is_found_in_a_small_picture(times):
 
     size = WIDTH // times, HEIGHT // times
     part = np.divide(size, (WIDTH, HEIGHT))
-    detector = SmallTargetDetector()
+    detector = make_detector(SPECK, RATE)
     pictures = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in film(80, paint)]
     found = [detector.detect(Frame(picture, i / RATE)) for i, picture in enumerate(pictures)]
     assert found[-1].mask.shape == size[::-1]
@@ -391,7 +391,7 @@ def test_frames_that_repeat_and_times_that_jump():
         draw(picture, 60 + 3 * i, 80, 8, 5)
 
     pictures = film(24, paint)
-    detector = SmallTargetDetector()
+    detector = make_detector(SPECK, RATE)
     for i, picture in enumerate(pictures):
         found = detector.detect(Frame(picture, i / RATE)).boxes
     assert found

@@ -1,4 +1,4 @@
-"""Detect small targets, moving or hovering, by contrast and change, with a fixed camera that may shake.
+"""Find small targets, moving or hovering, by contrast and change, with a fixed camera that may shake.
 
 Movement alone cannot find a bird that hovers, and contrast alone finds every sign and chimney. The score multiplies
 both: the contrast in standard deviations of the surroundings, and the part of it that was not there before, in units of
@@ -11,10 +11,10 @@ It is the half of `cotarget.detection.auto` that finds small targets. Measuremen
 from cotarget.detection.small_target.camera_motion import CameraMotion
 from cotarget.detection.small_target.change import History, changes
 from cotarget.detection.small_target.contrast import SmallTarget, find_small_targets
-from cotarget.detection.small_target.detector import SmallTargetDetector
+from cotarget.detection.small_target.finder import SmallTargetFinder
 from cotarget.detection.small_target.score import CLEAR_SIGNAL, WEIGHTS, Weights, evidence, small_target_score
 
 __all__ = [
-    "CLEAR_SIGNAL", "WEIGHTS", "CameraMotion", "History", "SmallTarget", "SmallTargetDetector", "Weights", "changes",
+    "CLEAR_SIGNAL", "WEIGHTS", "CameraMotion", "History", "SmallTarget", "SmallTargetFinder", "Weights", "changes",
     "evidence", "find_small_targets", "small_target_score",
 ]  # fmt: skip

@@ -1,15 +1,14 @@
-"""Detect small targets by contrast and change, each with a score, and in the difference from earlier images."""
+"""Find small targets by contrast and change, each with a score, and in the difference from earlier images."""
 
 import functools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, box_detection, check_size, is_clipped, moved
+from cotarget.detection.base import Detections, box_detection, is_clipped, moved
 from cotarget.detection.small_target.camera_motion import CameraMotion
 from cotarget.detection.small_target.change import AGES_S, History, changes
 from cotarget.detection.small_target.contrast import (
@@ -28,18 +27,14 @@ from cotarget.detection.small_target.score import WEIGHTS, Weights, small_target
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image
 
-if TYPE_CHECKING:
-    from cotarget.tracking.track import Track
-
-
 # Least contrast, in standard deviations of the surroundings.
 LEAST_SIGNAL = 4.5
 # Most regions examined in a frame, the strongest first; bounds the computing time.
 MOST_TARGETS = 40
 # Steepness of the score of a region of the difference.
 SLOPE = 3.4
-# Least score of a detection; a target that stays quiet for a moment is above it.
-LEAST_SCORE = 0.02
+# Least score of a detection. The tracker begins no track with so little; a target that hovers before trees keeps it.
+LEAST_SCORE = 0.005
 # Score from which a region is more likely a target than not.
 BELIEVED_SCORE = 0.5
 # Change from which a region has arrived as a whole; for a sign with a bird flying in front of it, it is a tenth.
@@ -70,10 +65,10 @@ NOISY_SIGNAL = 5.5
 WARM_UP_S, AFTER_CUT_S = 0.09, AGES_S[1]
 
 
-class SmallTargetDetector:
-    """Detect small targets by contrast and change, each with a score."""
+class SmallTargetFinder:
+    """Find small targets by contrast and change, each with a score."""
 
-    def __init__(self, least_score: float = LEAST_SCORE, weights: Weights = WEIGHTS) -> None:
+    def __init__(self, weights: Weights = WEIGHTS, least_score: float = LEAST_SCORE) -> None:
         """Start without history; ``least_score`` is that of a detection."""
         self._least_score, self._weights = least_score, weights
         self.camera = CameraMotion()
@@ -81,28 +76,18 @@ class SmallTargetDetector:
         self._warm_up_s = WARM_UP_S
         self._usual: Image | None = None  # mean difference from earlier images, float32
         self.shift: Array = np.zeros(2)  # of the camera since the first frame [px], (2,)
-        self._shape: tuple[int, ...] | None = None
         self.repeated = False  # whether the last frame repeats the one before
 
-    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
-        """Detect regions that stand out and change.
-
-        A frame that repeats the last one gives no detections.
-
-        Raises:
-            CotargetError: the image's size changed.
-        """
-        return self.search(frame)[1]
-
-    def search(self, frame: Frame, exposure: float = 1.0) -> tuple[list[SmallTarget], Detections]:
-        """Detect as `detect` does; also return the region of each box, in the enlarged image of a small one.
+    def find(self, frame: Frame, exposure: float = 1.0) -> tuple[list[SmallTarget], Detections]:
+        """Find regions that stand out and change, none in a frame that repeats the last one.
 
         Args:
             frame: frame of the camera.
             exposure: its brightness relative to a reference.
+
+        Returns:
+            The regions, in the enlarged image of a small one, and their boxes, best first.
         """
-        check_size(self._shape, frame.image)
-        self._shape = frame.image.shape
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
         finer: list[Image] = []
         while grey.shape[1] > WIDEST_PX:
