@@ -11,6 +11,7 @@ import numpy as np
 
 from cotarget.config import TargetProfile
 from cotarget.detection.auto import AutoDetector
+from cotarget.detection.background import LEAST_PART
 from cotarget.detection.base import Detections, Detector, ExternalDetector
 from cotarget.detection.color_template import ColorTemplateDetector
 from cotarget.detection.mog2 import FLYING, ON_THE_GROUND, Mog2Detector
@@ -48,7 +49,8 @@ def make_detector(target: TargetProfile, rate_hz: float) -> Detector:
     if kind == "onnx":
         return ExternalDetector(make_network(target))
     if kind in ("auto", "motion", "speck"):
-        return AutoDetector(rate_hz, shape=target.shape, small=kind != "motion", large=kind != "speck")
+        least_part = LEAST_PART if kind == "motion" else 0.0
+        return AutoDetector(rate_hz, shape=target.shape, least_part=least_part, background=kind != "speck")
     if kind == "mog2":
         return Mog2Detector(FLYING if target.motion == "flying" else ON_THE_GROUND, rate_hz)
     if target.template is None:

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.detection.background import LEAST_PART, WIDE, LargeTargetFinder
+from cotarget.detection.background import WIDE, LargeTargetFinder
 from cotarget.detection.base import Detections, SizeCheck
 from cotarget.detection.exposure import Exposure
 from cotarget.detection.small_target import WEIGHTS, SmallTarget, SmallTargetFinder, Weights
@@ -37,13 +37,12 @@ SHAKE_PART, VIEW_PART, QUIET_PART = 3 / 640, 0.1, 0.5 / 640
 STEADY_S = 0.2
 # Largest texture beside a target before a plain background [grey levels].
 PLAIN = 5.0
-# Part of a large target that a small one covers if they are the same target.
+# Part of a large target that a small one covers if they are the same target; one of which the large target covers less
+# than 1 - SAME is much larger.
 SAME = 0.6
-# Part of a small target that the large one covers at most, if the small one is much larger.
-MOST = 0.4
-# A track follows a small target if their larger sides differ by less than the first factor. Inside a large target whose
-# area is larger by more than the second factor, it is then another target, such as a bird before a cloud.
-SIDE_RATIO, AREA_RATIO = 2.0, 4.0
+# A track follows a small target if their larger sides differ by less than this factor. Inside a large target whose area
+# is larger by more than its square, it is then another target, such as a bird before a cloud.
+SIDE_RATIO = 2.0
 # Part of a small target inside a large one from which it is a part of it.
 INSIDE = 0.5
 # Time for which the background under a confirmed track is not learnt, from when the track last moved by its size [s].
@@ -68,8 +67,8 @@ class AutoDetector:
         weights: Weights = WEIGHTS,
         shape: float | None = None,
         *,
-        small: bool = True,
-        large: bool = True,
+        least_part: float = 0.0,
+        background: bool = True,
     ) -> None:
         """Start without history and background.
 
@@ -77,17 +76,17 @@ class AutoDetector:
             rate_hz: nominal frame rate [Hz].
             weights: of the score of small targets, see `cotarget.detection.small_target.small_target_score`.
             shape: expected width over height of the target's box; None if it is unknown.
-            small: whether targets may be smaller than LEAST_PART of the image's width.
-            large: whether to search for large ones by a background model, and not only before a plain background.
+            least_part: least larger side of a target, in parts of the image's width.
+            background: whether to find large targets by a background model, and not only before a plain background.
         """
-        self._shape, self._with_small, self._with_large = shape, small, large
-        self._small = SmallTargetFinder(weights)
-        self._large = LargeTargetFinder(rate_hz, upright=shape is not None and shape < WIDE)
+        self._shape, self._least_part, self._with_background = shape, least_part, background
+        self._small_finder = SmallTargetFinder(weights)
+        self._large_finder = LargeTargetFinder(rate_hz, upright=shape is not None and shape < WIDE)
         self._size = SizeCheck()
         self._clutter = Clutter()
         self._exposure = Exposure()
         self._apart: list[Detection] = []  # small targets that are no part of a large one, best first
-        self._background: Detections | None = None  # what the background model found last
+        self._large: Detections | None = None  # large targets, found last
         self._begun = np.zeros(2)  # the camera's shift when the background was begun [px]
         self._shifts: deque[tuple[float, Array]] = deque()  # the camera's shift in the last frames [px]
         self._moved: dict[int, tuple[float, Array]] = {}  # when a track last moved by its size, and where to
@@ -104,15 +103,15 @@ class AutoDetector:
         width = frame.image.shape[1]
         exposure = self._exposure.measure(frame)
         self._hold(held, width)
-        targets, contrast = self._small.find(frame, exposure)
-        steady, shift_px = self._register(frame.t, width)
+        targets, contrast = self._small_finder.find(frame, exposure)
+        shift_px = self._register(frame.t, width)
         boxes: list[Detection] = []
-        if not self._small.repeated:  # a repeated frame says nothing of where targets usually are
-            boxes = self._boxes(frame, exposure, targets, contrast.boxes, shift_px if steady else None)
+        if not self._small_finder.repeated:  # a repeated frame says nothing of where targets usually are
+            boxes = self._boxes(frame, exposure, targets, contrast.boxes, shift_px)
         make_mask = contrast.make_mask
-        if steady and self._background is not None:
-            make_mask = partial(_mask, self._background, self._apart)
-        return Detections(boxes, make_mask, self._small.shift, self._small.camera.jumped)
+        if shift_px is not None and self._large is not None:
+            make_mask = partial(_mask, self._large, self._apart)
+        return Detections(boxes, make_mask, self._small_finder.shift, self._small_finder.camera.jumped)
 
     def _boxes(
         self,
@@ -125,35 +124,32 @@ class AutoDetector:
         """Weigh the small targets of a frame, and add the large ones if the background's shift is given, best first."""
         width = frame.image.shape[1]
         found = small = self._clutter.weigh(boxes, frame.t, width, self._held)
-        if shift_px is not None and self._with_large:
-            self._background = self._large.find(frame, self._held, shift_px, exposure)
+        like = partial(likeness, shape=self._shape)
+        if shift_px is not None and self._with_background:
+            self._large = self._large_finder.find(frame, self._held, shift_px, exposure)
             outlined = [target.whole or target.beside <= PLAIN for target in targets]
             followed = self._are_followed(small, frame.t, width)
-            found = fuse(small, outlined, followed, self._background.boxes, self._likeness)
-        least = 0.0 if self._with_small else LEAST_PART * width
-        found = [each for each in found if each.size_px.max() >= least]
+            found = fuse(small, outlined, followed, self._large.boxes, like)
+        found = [each for each in found if each.size_px.max() >= self._least_part * width]
         self._apart = [each for each in found if any(each is one for one in small)]
-        weighed = [replace(each, score=self._likeness(each) * each.score) for each in found]
+        weighed = [replace(each, score=like(each) * each.score) for each in found]
         return sorted(weighed, key=lambda each: -each.score)
 
-    def _likeness(self, found: Detection) -> float:
-        """Likelihood ratio of a detection's shape for the target, at most 1; 1 if either is not known."""
-        return 1.0 if self._shape is None or found.clipped else likeness(found, self._shape)
-
-    def _register(self, t: float, width: int) -> tuple[bool, Array]:
-        """Whether the camera has stood still for STEADY_S, and the shift since the background was begun (2,) [px]."""
-        shift, least = self._small.shift, SHAKE_PART * width
+    def _register(self, t: float, width: int) -> Array | None:
+        """Return the shift since the background was begun (2,) [px]; None unless the camera has stood for STEADY_S."""
+        shift = self._small_finder.shift
         self._shifts.append((t, shift))
         while not 0 <= t - self._shifts[0][0] <= STEADY_S:
             self._shifts.popleft()
         off = shift - self._begun
-        if self._small.camera.jumped or np.abs(off).max() > VIEW_PART * width:
+        if self._small_finder.camera.jumped or np.abs(off).max() > VIEW_PART * width:
             self._begun, off = shift, np.zeros(2)
-            self._large.forget()
+            self._large_finder.forget()
             self._clutter.forget()
         # Less than a quarter of a pixel of the reduced image is no shift but noise.
         off = off if np.abs(off).max() > QUIET_PART * width else np.zeros(2)
-        return all(np.abs(shift - before).max() <= least for _, before in self._shifts), off
+        steady = all(np.abs(shift - before).max() <= SHAKE_PART * width for _, before in self._shifts)
+        return off if steady else None
 
     def _are_followed(self, small: Sequence[Detection], t: float, width: int) -> list[bool]:
         """Whether a confirmed track of its size, predicted at time ``t`` [s], follows each small target."""
@@ -248,8 +244,8 @@ def fuse(
 
     A large target is not listed where contrast outlines it better: before a plain background, or much larger, as an
     aeroplane whose front alone has changed; but not where that is less like the target, as a person with a shadow is.
-    Otherwise the small targets in a large one, such as head and shoes, are
-    parts of it, unless a track has followed one of them for itself.
+    Otherwise the small targets in a large one, such as head and shoes, are parts of it, unless a track has followed one
+    of them for itself.
 
     Args:
         small: targets found by contrast.
@@ -265,29 +261,31 @@ def fuse(
             for each, plain in zip(small, outlined, strict=True)
             if _covered(whole, each) > SAME and like(each) >= like(whole)
         ]
-        if any(plain or _covered(each, whole) < MOST for each, plain in same):
+        if any(plain or _covered(each, whole) < 1 - SAME for each, plain in same):
             continue
         inside = [each for each, plain in zip(small, outlined, strict=True) if plain and _covered(each, whole) > INSIDE]
-        if any(AREA_RATIO * each.size_px.prod() > whole.size_px.prod() for each in inside):
+        if any(SIDE_RATIO**2 * each.size_px.prod() > whole.size_px.prod() for each in inside):
             continue  # the rest of it is the place that the target has left
         parts = [
             each
             for each, own in zip(small, followed, strict=True)
             if (_covered(each, whole) > INSIDE or _covered(whole, each) > SAME)
-            and not (own and AREA_RATIO * each.size_px.prod() < whole.size_px.prod())
+            and not (own and SIDE_RATIO**2 * each.size_px.prod() < whole.size_px.prod())
         ]
         found = [each for each in found if not any(each is part for part in parts)]
         found.append(replace(whole, score=max([whole.score, *(part.score for part in parts)])))
     return sorted(found, key=lambda each: -each.score)
 
 
-def likeness(found: Detection, shape: float) -> float:
-    """Likelihood ratio of a detection's shape, if that is less than 1.
+def likeness(found: Detection, shape: float | None) -> float:
+    """Likelihood ratio of a detection's shape for the target, at most 1; 1 if either is not known.
 
     Args:
         found: the detection.
         shape: expected width over height of a target's box.
     """
+    if shape is None or found.clipped:
+        return 1.0
     observed = math.log(found.size_px[0] / found.size_px[1])
     of_target = _normal(observed - math.log(shape), SHAPE_SIGMA) / _normal(observed, OTHER_SIGMA)
     return min(1.0, OTHER_PART + (1 - OTHER_PART) * of_target)
