@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.detection.background import WIDE, LargeTargetFinder
-from cotarget.detection.base import Detections, SizeCheck
+from cotarget.detection.base import LASTING_S, Detections, SizeCheck
 from cotarget.detection.exposure import Exposure
 from cotarget.detection.small_target import WEIGHTS, SmallTarget, SmallTargetFinder, Weights
 from cotarget.geometry import Array, intersection_areas
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 # In parts of the image's width: most that a camera shakes, more is a pan; shift at which the background is learnt
 # again, because too much of it is out of view; and least shift that counts.
 SHAKE_PART, VIEW_PART, QUIET_PART = 3 / 640, 0.1, 0.5 / 640
-# Time for which a camera that has moved must stand still before large targets are searched [s].
-STEADY_S = 0.2
 # Largest texture beside a target before a plain background [grey levels].
 PLAIN = 5.0
 # Part of a large target that a small one covers if they are the same target; one of which the large target covers less
@@ -136,10 +134,10 @@ class AutoDetector:
         return sorted(weighed, key=lambda each: -each.score)
 
     def _register(self, t: float, width: int) -> Array | None:
-        """Return the shift since the background was begun (2,) [px]; None unless the camera has stood for STEADY_S."""
+        """Return the shift since the background was begun (2,) [px]; None unless the camera has stood for LASTING_S."""
         shift = self._small_finder.shift
         self._shifts.append((t, shift))
-        while not 0 <= t - self._shifts[0][0] <= STEADY_S:
+        while not 0 <= t - self._shifts[0][0] <= LASTING_S:
             self._shifts.popleft()
         off = shift - self._begun
         if self._small_finder.camera.jumped or np.abs(off).max() > VIEW_PART * width:

@@ -13,9 +13,11 @@ import numpy as np
 
 from cotarget.detection.base import (
     FOREGROUND,
+    LASTING_S,
     Detections,
     box_detection,
     flood,
+    halvings,
     is_clipped,
     moved,
     pieces,
@@ -27,14 +29,11 @@ from cotarget.rig import Detection, Frame, Image
 STANDING = np.zeros(2)
 # Images are halved until they are at most this wide [px]; the lengths below are in pixels of the result.
 WIDEST_PX = 480
-# The mixture: its memory, the time that is learnt before anything is detected, and the interval at which the background
-# is learnt beside what is held and its image is read, a third of a frame's work [s]; the part of a pixel's history that
-# is its background; and the squared distance to it, in variances, from which a pixel is foreground.
-HISTORY_S, WARM_UP_S, UPDATE_S = 20.0, 0.2, 0.2
+# The mixture: its memory, and the interval at which the background is learnt beside what is held and its image is read,
+# a third of a frame's work [s]; the part of a pixel's history that is its background; and the squared distance to it,
+# in variances, from which a pixel is foreground.
+HISTORY_S, UPDATE_S = 20.0, 0.2
 BACKGROUND_PART, THRESHOLD = 0.7, 20.0
-# Time for which foreground may fill the image, as after a nudge, before the background is learnt again [s]. The mixture
-# alone would take as long as its memory, and targets would not be seen meanwhile.
-FLOODED_S = 0.2
 # Foreground thinner than the first is removed, but not that within the second of what is left: feet and rotors. Gaps
 # (across, down) that are closed within a target: what stands side by side is not bridged [px].
 OPENING_PX, RIM_PX, BRIDGE_PX = 3, 2, (1, 9)
@@ -75,6 +74,7 @@ class LargeTargetFinder:
             history=max(1, round(HISTORY_S * rate_hz)), varThreshold=THRESHOLD, detectShadows=True
         )
         self._model.setBackgroundRatio(BACKGROUND_PART)
+        self._model.setShadowValue(0)
         self._t: float | None = None
         self._learnt = 0.0
         self._since: float | None = None  # time since which foreground fills the image
@@ -95,13 +95,10 @@ class LargeTargetFinder:
             shift_px: shift of the scene since the background was begun (du, dv) [px], (2,).
             exposure: relative brightness of the image, which is undone.
         """
-        image, factor = frame.image, 1
-        while image.shape[1] > WIDEST_PX:
-            image = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-            factor *= 2
-        image = np.asarray(cv2.convertScaleAbs(image, alpha=1 / exposure), dtype=np.uint8)
+        images = halvings(frame.image, WIDEST_PX)
+        factor = 2 ** (len(images) - 1)
         shift = shift_px / factor
-        image = moved(image, -shift)
+        image = moved(np.asarray(cv2.convertScaleAbs(images[-1], alpha=1 / exposure), dtype=np.uint8), -shift)
         mask = self._subtract(image, frame.t, _reduced_boxes(places, shift_px, factor))
         opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((OPENING_PX,) * 2, np.uint8))
         near = cv2.dilate(opened, np.ones((2 * RIM_PX + 1,) * 2, np.uint8))
@@ -110,11 +107,11 @@ class LargeTargetFinder:
             seen = _moved_mask(np.full(mask.shape, FOREGROUND, np.uint8), -shift)
             mask = np.asarray(cv2.bitwise_and(mask, cv2.compare(seen, FOREGROUND, cv2.CMP_EQ)), dtype=np.uint8)
         make_mask = partial(_full_size, _moved_mask(mask, shift), frame.image.shape)
-        if self._learnt < WARM_UP_S:
+        if self._learnt < LASTING_S:
             return Detections([], make_mask)
         if flood(mask):
             self._since = frame.t if self._since is None else self._since
-            if frame.t - self._since >= FLOODED_S:
+            if frame.t - self._since >= LASTING_S:  # the mixture alone would take as long as its memory
                 self.forget()
             return Detections([], make_mask)
         self._since = None
@@ -134,8 +131,7 @@ class LargeTargetFinder:
     def _subtract(self, image: Image, t: float, held: Sequence[tuple[slice, slice]]) -> Image:
         """Find the foreground at time ``t`` [s] without lit ground, and learn the background but for what is held."""
         at_once = not held or not self._learnt
-        mask = np.asarray(self._model.apply(image, learningRate=self._rate(t) if at_once else 0))
-        mask = np.asarray(cv2.threshold(mask, FOREGROUND - 1, FOREGROUND, cv2.THRESH_BINARY)[1], dtype=np.uint8)
+        mask = np.asarray(self._model.apply(image, learningRate=self._rate(t) if at_once else 0), dtype=np.uint8)
         lit = self._lit(mask, image, held)
         if not at_once and (self._t is None or not 0 <= t - self._t < UPDATE_S):
             kept = np.zeros(mask.shape, np.uint8)
@@ -268,9 +264,7 @@ def _reduced_boxes(places: Sequence[tuple[Array, Array]], shift_px: Array, facto
 
 
 def _full_size(mask: Image, shape: tuple[int, ...]) -> Image:
-    """Enlarge a mask to an image of a shape (H, W, 3), if it is smaller."""
-    if mask.shape == shape[:2]:
-        return mask
+    """Enlarge a mask to an image of a shape (H, W, 3)."""
     return np.asarray(cv2.resize(mask, shape[1::-1], interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
 
 

@@ -23,10 +23,12 @@ from cotarget.rig import Detection, Frame, Image
 if TYPE_CHECKING:
     from cotarget.tracking.track import Track
 
-# Foreground in a mask; in that of OpenCV's mixture, a shadow is 127.
+# Foreground in a mask.
 FOREGROUND = 255
 # Largest part of foreground that may be targets; beyond it, the light or the camera has changed.
 MOST_FOREGROUND = 0.45
+# Time for which a picture must be another, or a camera must stand, before it counts: a flash is shorter [s].
+LASTING_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,15 @@ def is_clipped(center_px: Array, size_px: Array, shape: tuple[int, ...]) -> bool
     """Whether a box reaches the border of an image of a shape (H, W, ...)."""
     low, high = center_px - (size_px - 1) / 2, center_px + (size_px - 1) / 2
     return bool((low <= 0).any() or (high >= np.array(shape[1::-1]) - 1).any())
+
+
+def halvings(image: Image, widest_px: int) -> list[Image]:
+    """Return an image and its halvings, until one is at most ``widest_px`` wide [px]."""
+    images = [image]
+    while images[-1].shape[1] > widest_px:
+        half = cv2.resize(images[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        images.append(np.asarray(half, dtype=np.uint8))
+    return images
 
 
 def moved(image: Image, shift: Array) -> Image:

@@ -5,6 +5,8 @@ import math
 import cv2
 import numpy as np
 
+from cotarget.detection.background import HISTORY_S
+from cotarget.detection.base import LASTING_S
 from cotarget.geometry import Array
 from cotarget.rig import Frame
 
@@ -14,13 +16,13 @@ CELLS = (32, 24)
 # of the change. Beyond these, the picture has changed and not the exposure.
 AGREEMENT, FEWEST = 0.1, 0.5
 DARKEST, BRIGHTEST = 1 / 3, 1.5
-# Time constant with which the reference follows, as long as the background's memory; and time for which a picture must
-# have changed to be the new reference, which a flash has not [s].
-FOLLOWS_S, CHANGED_S = 20.0, 0.2
+# Images are compared if their exposures differ by at most this part, because a codec draws texture again; time over
+# which exposures are averaged for it, so that a lamp may flicker and a cloud pass [s].
+SAME_EXPOSURE, AVERAGED_S = 0.02, 0.5
 
 
 class Exposure:
-    """Measures the brightness of images relative to that of the last seconds."""
+    """Measures the brightness of images relative to that of the last HISTORY_S."""
 
     def __init__(self) -> None:
         """Start without a reference."""
@@ -41,9 +43,9 @@ class Exposure:
         since, self._t = max(0.0, frame.t - self._t), frame.t
         if np.mean(np.abs(ratio / change - 1) < AGREEMENT) < FEWEST or not DARKEST < change < BRIGHTEST:
             self._changed_t = frame.t if self._changed_t is None else self._changed_t
-            if frame.t - self._changed_t >= CHANGED_S:
+            if frame.t - self._changed_t >= LASTING_S:
                 self._reference, self._changed_t = cells, None
             return 1.0
         self._changed_t = None
-        self._reference = self._reference + (1 - math.exp(-since / FOLLOWS_S)) * (cells - self._reference)
+        self._reference = self._reference + (1 - math.exp(-since / HISTORY_S)) * (cells - self._reference)
         return change

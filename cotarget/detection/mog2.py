@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from cotarget.detection.base import FOREGROUND, Detections, SizeCheck, box_detection, flood, pieces
+from cotarget.detection.base import Detections, SizeCheck, box_detection, flood, pieces
 from cotarget.rig import Frame
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ class Mog2Detector:
         self._model = cv2.createBackgroundSubtractorMOG2(
             history=max(1, round(HISTORY_S * rate_hz)), varThreshold=THRESHOLD, detectShadows=grouping.shadows
         )
+        self._model.setShadowValue(0)
         self._unlearnt = round(WARM_UP_S * rate_hz)  # frames
         self._size = SizeCheck()
 
@@ -65,8 +66,6 @@ class Mog2Detector:
         """
         self._size.check(frame.image)
         mask = np.asarray(self._model.apply(frame.image), dtype=np.uint8)
-        if self._grouping.shadows:
-            mask = np.asarray(cv2.threshold(mask, FOREGROUND - 1, FOREGROUND, cv2.THRESH_BINARY)[1], dtype=np.uint8)
         if self._grouping.opening_px:
             opening = np.ones((self._grouping.opening_px,) * 2, np.uint8)
             mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_OPEN, opening), dtype=np.uint8)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from cotarget.detection.exposure import AVERAGED_S, SAME_EXPOSURE
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
@@ -14,10 +15,6 @@ from cotarget.rig import Image
 AGES_S = (0.07, 0.17, 0.5, 1.0)
 # Relative tolerance of an image's age.
 AGE_TOLERANCE = 0.5
-# Relative difference of exposures from which images are not compared: a codec draws texture anew.
-EXPOSURE_TOLERANCE = 0.02
-# Time over which it is averaged, so that a lamp may flicker and a cloud pass [s].
-EXPOSURE_S = 0.5
 # Least time between two kept images [s].
 SPACING_S = 0.03
 # Search for the best match: this many pixels if the camera stands; plus this part of its shift, for parallax and
@@ -79,11 +76,11 @@ class History:
         self._last = grey
         if not self._kept or t - self._kept[-1][0] >= SPACING_S:
             since = t - self._kept[-1][0] if self._kept else math.inf
-            self._exposure += (1 - math.exp(-since / EXPOSURE_S)) * (exposure - self._exposure)
+            self._exposure += (1 - math.exp(-since / AVERAGED_S)) * (exposure - self._exposure)
             self._kept.append((t, grey, shift, self._exposure))
             while (
                 t - self._kept[0][0] > (1 + AGE_TOLERANCE) * AGES_S[-1]
-                or abs(self._kept[0][3] / self._exposure - 1) > EXPOSURE_TOLERANCE
+                or abs(self._kept[0][3] / self._exposure - 1) > SAME_EXPOSURE
             ):
                 self._kept.popleft()
         return True

@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, box_detection, is_clipped, moved
+from cotarget.detection.base import Detections, box_detection, halvings, is_clipped, moved
 from cotarget.detection.small_target.camera_motion import CameraMotion
 from cotarget.detection.small_target.change import AGES_S, History, changes
 from cotarget.detection.small_target.contrast import (
@@ -88,11 +88,8 @@ class SmallTargetFinder:
         Returns:
             The regions, in the enlarged image of a small one, and their boxes, best first.
         """
-        grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
-        finer: list[Image] = []
-        while grey.shape[1] > WIDEST_PX:
-            finer.append(grey)
-            grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        *finer, grey = halvings(grey, WIDEST_PX)
         unit = 2 ** len(finer)
         shift = self.camera.update(grey)  # measured without enlargement, in which soft scenes have no corners
         self.shift = unit * shift
