@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, SizeCheck, box_detection
+from cotarget.detection.base import Detections, SizeCheck, box_detection, pieces
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image
@@ -188,10 +188,8 @@ class ColorTemplateDetector:
         self._size.check(frame.image)
         tests = cv2.transform(frame.image, self._tests)  # saturates at 0, so a wrong hue fails one of the last two
         mask = np.asarray(cv2.inRange(tests, (LEAST_WEIGHT * CHROMA_BYTE, 1, 1), (255, 255, 255)), dtype=np.uint8)
-        joined = cv2.dilate(mask, np.ones((3, 3), np.uint8))
         boxes = []
-        for contour in cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
-            x, y, w, h = cv2.boundingRect(contour)
+        for x, y, w, h in pieces(mask, (3, 3)):
             inside = mask[y : y + h, x : x + w]
             if cv2.countNonZero(inside) < LEAST_PIXELS:
                 continue

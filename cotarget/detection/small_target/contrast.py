@@ -165,7 +165,7 @@ def _peaks(
         level: image at this scale, (H, W).
         half: the same in half the size.
         scale: number of halvings.
-        sloping: whether to fit a plane to the ring.
+        sloping: whether to fit a plane to the ring, which is so large that a sky's gradient counts.
         threshold: least contrast, in standard deviations of the surroundings.
         most: most peaks.
         finer: image of twice the size in which targets of one or two pixels are searched too; None for none.
@@ -210,12 +210,7 @@ def _peaks(
 
 
 def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
-    """Mean of the ring around each pixel, and the standard deviation from that mean or from a fitted plane.
-
-    Args:
-        half: image of half the size.
-        sloping: whether to fit a plane, for rings so large that a sky's gradient counts.
-    """
+    """Mean of the ring around each pixel of an image of half the size, and the deviation from it or from a plane."""
     total = _box_sum(half, cv2.boxFilter)
     squares = _box_sum(half, cv2.sqrBoxFilter)
     count = np.float32(OUTER_HALF_PX**2 - GUARD_HALF_PX**2)
@@ -223,8 +218,10 @@ def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
     variance = squares / count - mean * mean
     if not sloping:
         return mean, cv2.sqrt(np.maximum(variance, np.float32(LEAST_ROUGHNESS**2)))
-    # The slope along each axis is the ring's first moment over its second moment along that axis.
-    moment = np.float32((_axis_moment(OUTER_HALF_PX) - _axis_moment(GUARD_HALF_PX)) * count)
+    # The slope along each axis is the ring's first moment over its second moment along that axis. That of a square is
+    # n^2 (n^2 - 1) / 12.
+    outer, inner = (side**2 * (side**2 - 1) / 12 for side in (OUTER_HALF_PX, GUARD_HALF_PX))
+    moment = np.float32((outer - inner) * count)
     for k in (0, 1):
         first = _first_moment(half, OUTER_HALF_PX, k)
         cv2.subtract(first, _first_moment(half, GUARD_HALF_PX, k), first)
@@ -236,11 +233,6 @@ def _box_sum(half: Image, box: Callable[..., Array]) -> Array:
     """Sum of the image, or of its squares, over the ring around each pixel."""
     total = box(half, cv2.CV_32F, (OUTER_HALF_PX,) * 2, normalize=False)
     return cv2.subtract(total, box(half, cv2.CV_32F, (GUARD_HALF_PX,) * 2, normalize=False), total)
-
-
-def _axis_moment(side: int) -> float:
-    """Sum over a square of the squared distance from its middle column."""
-    return side * float(np.sum(np.square(np.arange(side) - side // 2)))
 
 
 def _first_moment(half: Image, side: int, axis: int) -> Array:
@@ -268,22 +260,17 @@ def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> Small
     near = window[max(0, v - top - factor) : v - top + factor + 1, max(0, u - left - factor) : u - left + factor + 1]
     j, i = (int(n) for n in np.unravel_index(int(np.argmax(np.abs(near))), near.shape))
     contrast = float(near[j, i])
-    at = max(0, v - top - factor) + j, max(0, u - left - factor) + i
+    at = max(0, u - left - factor) + i, max(0, v - top - factor) + j
     # An aeroplane has bright and dark parts.
     inside = window * np.sign(contrast) if of_difference else np.abs(window)
-    x, y, w, h = _component(inside > OUTLINE * abs(contrast), at)
+    there = (inside > OUTLINE * abs(contrast)).astype(np.uint8)
+    x, y, w, h = cv2.floodFill(there, None, at, (2,), flags=8)[3]
     bottom, right = window.shape
     across = (x == 0 and left > 0) or (x + w == right and left + right < image.shape[1])
     down = (y == 0 and top > 0) or (y + h == bottom and top + bottom < image.shape[0])
     if across or down:
         return None  # it goes on beyond its ring: a pole, or a target for the next scale
     return SmallTarget((unit * (left + x), unit * (top + y)), (unit * w, unit * h), contrast, peak.signal, around)
-
-
-def _component(inside: np.ndarray, at: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Find the box of the connected component at a pixel (row, column): left, top, width and height."""
-    x, y, w, h = cv2.floodFill(inside.astype(np.uint8), None, at[::-1], (2,), flags=8)[3]
-    return x, y, w, h
 
 
 def mostly_in(part: SmallTarget, whole: SmallTarget) -> bool:

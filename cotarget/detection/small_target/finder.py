@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -64,6 +64,8 @@ NOISY_SIGNAL = 5.5
 # cut, whose new scene must be seen for a while [s].
 WARM_UP_S, AFTER_CUT_S = 0.09, AGES_S[1]
 
+Found = tuple[SmallTarget, Detection]  # a region and its box
+
 
 class SmallTargetFinder:
     """Find small targets by contrast and change, each with a score."""
@@ -104,8 +106,8 @@ class SmallTargetFinder:
             return [], Detections([], functools.partial(_mask, [], frame.image.shape, times))
         self._warm_up_s = WARM_UP_S
         shape = tuple(times * side for side in frame.image.shape[:2])
-        found: list[tuple[SmallTarget, Detection]] = []
-        arrived: list[tuple[SmallTarget, Detection]] = []
+        found: list[Found] = []
+        arrived: list[Found] = []
         noisy = times == MOST_TIMES and self._history.noise > LEAST_ROUGHNESS
         small = find_small_targets(grey, NOISY_SIGNAL if noisy else LEAST_SIGNAL, MOST_TARGETS, finer=finer)
         for target in [*find_wholes(grey, unit), *small]:
@@ -121,12 +123,11 @@ class SmallTargetFinder:
                 arrived.append((target, detection))
         differing = self._differing(grey, unit, times, shift, references)
         found += [_as_a_whole(pair, arrived) for pair in differing]
-        wholes: list[tuple[SmallTarget, Detection]] = []
-        for pair in sorted(arrived, key=lambda pair: -math.prod(pair[0].size)):
-            if pair[0].whole and not any(mostly_in(pair[0], whole) for whole, _ in wholes):
-                wholes.append(pair)
-        found = _best_of([pair for pair in found if not any(mostly_in(pair[0], whole) for whole, _ in wholes)])
-        found = sorted(wholes + found, key=lambda pair: -pair[1].score)
+        arrived.sort(key=lambda pair: -math.prod(pair[0].size))
+        wholes = _apart([pair for pair in arrived if pair[0].whole], mostly_in)
+        found = [pair for pair in found if not any(mostly_in(pair[0], whole) for whole, _ in wholes)]
+        found = wholes + _apart(sorted(found, key=_by_score), share)
+        found.sort(key=_by_score)
         boxes = [detection for _, detection in found]
         return [target for target, _ in found], Detections(
             boxes, functools.partial(_mask, found, frame.image.shape, times)
@@ -134,7 +135,7 @@ class SmallTargetFinder:
 
     def _differing(
         self, grey: Image, unit: int, times: int, shift: Array, references: list[tuple[Image, Array] | None]
-    ) -> list[tuple[SmallTarget, Detection]]:
+    ) -> list[Found]:
         """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
 
         The difference of an image enlarged by a factor ``times`` is halved: a twig sways over more of its pixels.
@@ -187,16 +188,12 @@ class SmallTargetFinder:
 
 def _enlarged(grey: Image) -> tuple[Image, int]:
     """Double an image while its larger side stays within WIDEST_PX; return it and its factor."""
-    times = 1
-    while times < MOST_TIMES and 2 * times * max(grey.shape) <= WIDEST_PX:
-        times *= 2
-    if times == 1:
-        return grey, times
+    times = next((n for n in (MOST_TIMES, 2) if n * max(grey.shape) <= WIDEST_PX), 1)
     enlarged = cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
     return np.asarray(enlarged, dtype=np.uint8), times
 
 
-def _mask(found: Sequence[tuple[SmallTarget, Detection]], shape: tuple[int, ...], times: int) -> Image:
+def _mask(found: Sequence[Found], shape: tuple[int, ...], times: int) -> Image:
     """Draw regions of an image enlarged by a factor ``times`` into one of a shape (H, W, 3), by their scores."""
     mask = np.zeros(shape[:2], np.uint8)
     for target, detection in reversed(found):
@@ -215,9 +212,7 @@ def _boxed(target: SmallTarget, score: float, shape: tuple[int, ...], times: int
     return replace(box, center_px=(box.center_px + 0.5) / times - 0.5, size_px=box.size_px / times)
 
 
-def _as_a_whole(
-    differing: tuple[SmallTarget, Detection], arrived: list[tuple[SmallTarget, Detection]]
-) -> tuple[SmallTarget, Detection]:
+def _as_a_whole(differing: Found, arrived: list[Found]) -> Found:
     """Replace a region of the difference by the arrived region that contains it, if there is one.
 
     Of a plain target that moves by less than its own length within AGES_S[0], only the front differs; its contrast
@@ -231,10 +226,15 @@ def _as_a_whole(
     return whole, replace(box, score=max(box.score, detection.score))
 
 
-def _best_of(found: list[tuple[SmallTarget, Detection]]) -> list[tuple[SmallTarget, Detection]]:
-    """Keep the best of regions that overlap; the best first."""
-    kept: list[tuple[SmallTarget, Detection]] = []
-    for target, detection in sorted(found, key=lambda pair: -pair[1].score):
-        if not any(share(target, other) for other, _ in kept):
-            kept.append((target, detection))
+def _by_score(pair: Found) -> float:
+    """Key that sorts regions by their score, the best first."""
+    return -pair[1].score
+
+
+def _apart(found: Sequence[Found], overlap: Callable[[SmallTarget, SmallTarget], bool]) -> list[Found]:
+    """Keep the first of regions that overlap."""
+    kept: list[Found] = []
+    for pair in found:
+        if not any(overlap(pair[0], other) for other, _ in kept):
+            kept.append(pair)
     return kept
