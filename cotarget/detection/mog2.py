@@ -17,8 +17,9 @@ from cotarget.rig import Frame
 if TYPE_CHECKING:
     from cotarget.tracking.track import Track
 
-# Memory of OpenCV's default mixture, 120 frames at 30 a second, and time that is learnt before a detection [s].
-HISTORY_S, WARM_UP_S = 4.0, 0.5
+# Memory of OpenCV's default mixture, 120 frames at 30 a second, and time from the first frame to the first that is
+# searched: the 13th at 25 a second, the 16th at 30 [s].
+HISTORY_S, WARM_UP_S = 4.0, 0.47
 # Squared distance to the background, in variances, from which a pixel is foreground.
 THRESHOLD = 25.0
 
@@ -55,7 +56,7 @@ class Mog2Detector:
             history=max(1, round(HISTORY_S * rate_hz)), varThreshold=THRESHOLD, detectShadows=grouping.shadows
         )
         self._model.setShadowValue(0)
-        self._unlearnt = round(WARM_UP_S * rate_hz)  # frames
+        self._begun_t: float | None = None
         self._size = SizeCheck()
 
     def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
@@ -69,8 +70,9 @@ class Mog2Detector:
         if self._grouping.opening_px:
             opening = np.ones((self._grouping.opening_px,) * 2, np.uint8)
             mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_OPEN, opening), dtype=np.uint8)
-        self._unlearnt -= 1
-        if self._unlearnt >= 0 or flood(mask):
+        if self._begun_t is None:
+            self._begun_t = frame.t
+        if frame.t - self._begun_t < WARM_UP_S or flood(mask):
             return Detections([], lambda: mask)
         found = []
         for x, y, w, h in pieces(mask, self._grouping.bridge_px):
