@@ -473,9 +473,10 @@ class TargetProfile:
         dimension: the dimension that ``size`` gives; a wingspan is the larger side of the target's box.
         wanted_px: size of that dimension in the close-up [px].
         detector: how the fixed camera's images are searched: "auto" finds what moves or stands out, from 3 px to half
-            the image's width, "motion" the same from 24 px in 640 on, "speck" the same without a background model,
-            "colour" matches a template, "mog2" is the paper's plain background subtraction, "onnx" is a neural network;
-            or a function of your own from an image to boxes, in a module beside rig.toml or on Python's path.
+            the image's width, "motion" the same for targets of at least 24 px in an image 640 px wide, "speck" the same
+            without a background model, "colour" matches a template, "mog2" is the paper's plain background subtraction,
+            "onnx" is a neural network; or a function of your own from an image to boxes, in a module beside rig.toml or
+            on Python's path.
         template: picture of the target, cut to its outline, for the detector "colour"; relative to rig.toml.
         motion: motion model; "general" covers anything that moves by itself.
         shape: expected width over height of the target's box; none if it is unknown or changes.

@@ -7,14 +7,17 @@ import shutil
 import subprocess
 import venv
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from cotarget.cli.main import main
+from cotarget.cli.replay import TracksByImage
 from cotarget.detection import make_detector
 from cotarget.errors import ConfigError
+from cotarget.rig import Frame
 from cotarget.track_metrics import Criterion, Label, Tracked, pooled, read_labels, read_tracks, score_tracks
 from cotarget.video import FilmWriter
 from tests.support.recorded_run import RATE_HZ, Bright, calibration_file, record
@@ -471,6 +474,17 @@ def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):
     assert f"1 of {len(steps) + 1} labelled frames are beyond the last one, {len(steps) - 1}," in err
     assert main([*arguments, str(tmp_path / "none.csv")]) == 1
     assert "none.csv" in capsys.readouterr().err
+
+
+def test_a_track_of_a_replay_ends_at_the_images_border_as_labels_do():
+    """Of a box of 10x6 px at the left border, 4 columns are outside."""
+    frame = Frame(np.zeros((48, 64, 3), np.uint8), 1.5)
+    near = SimpleNamespace(confirmed=True, id=3, center_px=np.array([0.5, 20.5]), size_px=np.array([10.0, 6.0]))
+    replayed = TracksByImage({1.5: 7})
+    replayed.see(SimpleNamespace(fixed=frame, tracks=[near]))
+    (found,) = replayed.tracks
+    assert (found.frame, found.track) == (7, 3)
+    np.testing.assert_allclose([found.center_px, found.size_px], [(2.5, 20.5), (6.0, 6.0)])
 
 
 @pytest.mark.foreign

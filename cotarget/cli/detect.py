@@ -35,8 +35,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     about = "search with this detector (that of the target)"
     parser.add_argument("--detector", choices=("auto", "mog2", "motion", "speck"), help=about)
     about = (
-        "write one line per reported track and frame, to stdout with -: u_px and v_px are the box's centre, the score "
-        "is 0 where the box is only predicted; for a folder of videos, an existing folder for their tables"
+        "write one line per reported track and frame, to stdout with -: u_px and v_px are the centre of the box, "
+        "which ends at the image's border; the score is 0 where the box is only predicted; for a folder of videos, an "
+        "existing folder for their tables"
     )
     add_file(parser, "--csv", about, required=True)
     add_file(parser, "--video", "write the video with the tracks drawn (.mp4)", "OUT")

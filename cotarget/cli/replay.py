@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 class TracksByImage:
-    """The reported tracks of a replay, with the numbers of the recorded images, which are given by exposure time."""
+    """The reported tracks of a replay within the image, with the numbers of the recorded images by exposure time."""
 
     warning = ""
 
@@ -81,9 +81,13 @@ class TracksByImage:
 
     def see(self, step: "Step") -> None:
         """Collect the tracks of a step."""
+        from cotarget.geometry import within_image
         from cotarget.track_metrics import Tracked
 
         frame = self._numbers[step.fixed.t]
+        height, width = step.fixed.image.shape[:2]
         self.tracks += [
-            Tracked(each.center_px, each.size_px, frame, step.fixed.t, each.id) for each in step.tracks if each.reported
+            Tracked(*within_image(each.center_px, each.size_px, (width, height)), frame, step.fixed.t, each.id)
+            for each in step.tracks
+            if each.reported
         ]
