@@ -14,21 +14,17 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cotarget.detection.background import WIDE, LargeTargetFinder
-from cotarget.detection.base import LASTING_S, Detections, SizeCheck
+from cotarget.detection.base import LASTING_S, Detections, SizeCheck, Tracks
 from cotarget.detection.exposure import Exposure
 from cotarget.detection.small_target import WEIGHTS, SmallTarget, SmallTargetFinder, Weights
 from cotarget.geometry import Array, intersection_areas
 from cotarget.rig import Detection, Frame, Image
-
-if TYPE_CHECKING:
-    from cotarget.tracking.track import Track
 
 # In parts of the image's width: most that a camera shakes, more is a pan; shift at which the background is learnt
 # again, because too much of it is out of view; and least shift that counts.
@@ -72,7 +68,7 @@ class AutoDetector:
 
         Args:
             rate_hz: nominal frame rate [Hz].
-            weights: of the score of small targets, see `cotarget.detection.small_target.small_target_score`.
+            weights: of the score of small targets, see `cotarget.detection.small_target.score`.
             shape: expected width over height of the target's box; None if it is unknown.
             least_part: least larger side of a target, in parts of the image's width.
             background: whether to find large targets by a background model, and not only before a plain background.
@@ -88,10 +84,10 @@ class AutoDetector:
         self._begun = np.zeros(2)  # the camera's shift when the background was begun [px]
         self._shifts: deque[tuple[float, Array]] = deque()  # the camera's shift in the last frames [px]
         self._moved: dict[int, tuple[float, Array]] = {}  # when a track last moved by its size, and where to
-        self._tracks: list[Track] = []  # confirmed tracks
+        self._tracks: Tracks = ()  # confirmed tracks
         self._held: list[tuple[Array, Array]] = []  # centre and size of each place whose background is not learnt
 
-    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+    def detect(self, frame: Frame, held: Tracks = ()) -> Detections:
         """Detect the targets; none in a frame that repeats the last one.
 
         Raises:
@@ -160,7 +156,7 @@ class AutoDetector:
         alike = np.abs(np.subtract.outer(*sides)) < np.log(SIDE_RATIO)
         return (near & alike).any(axis=1).tolist()
 
-    def _hold(self, tracks: Sequence["Track"], width: int) -> None:
+    def _hold(self, tracks: Tracks, width: int) -> None:
         """Do not learn the background under the confirmed ones of the last image's tracks."""
         margin = HELD_PART * width
         moved: dict[int, tuple[float, Array]] = {}

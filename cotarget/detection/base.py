@@ -23,6 +23,7 @@ from cotarget.rig import Detection, Frame, Image
 if TYPE_CHECKING:
     from cotarget.tracking.track import Track
 
+Tracks = Sequence["Track"]
 # Foreground in a mask.
 FOREGROUND = 255
 # Largest part of foreground that may be targets; beyond it, the light or the camera has changed.
@@ -56,7 +57,7 @@ class Detections:
 class Detector(Protocol):
     """Detects targets of one kind in the frames of one camera."""
 
-    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+    def detect(self, frame: Frame, held: Tracks = ()) -> Detections:
         """Detect the targets.
 
         Args:
@@ -175,7 +176,7 @@ class ExternalDetector:
         self._find = find
         self._size = SizeCheck()
 
-    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+    def detect(self, frame: Frame, held: Tracks = ()) -> Detections:
         """Detect what the function finds; boxes are cut to the image.
 
         Raises:

@@ -6,19 +6,14 @@ pose and the four of the brightness (the method of Lucas and Kanade, with a mode
 """
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, SizeCheck, box_detection, pieces
+from cotarget.detection.base import Detections, SizeCheck, Tracks, box_detection, pieces
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image
-
-if TYPE_CHECKING:
-    from cotarget.tracking.track import Track
 
 # Margin around a target's coarse box that is included [px]: blur and subsampled chroma reach about 3 px.
 MARGIN_PX = 4
@@ -179,7 +174,7 @@ class ColorTemplateDetector:
         self._tests = tests * CHROMA_BYTE / strong
         self._size = SizeCheck()
 
-    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+    def detect(self, frame: Frame, held: Tracks = ()) -> Detections:
         """Detect targets of the template's colour and shape.
 
         Raises:

@@ -4,18 +4,13 @@ The paper does not say how foreground is grouped. Here it is opened and closed, 
 target. Nothing is done against foliage, light or a camera that moves: `cotarget.detection.auto` is for these.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, SizeCheck, box_detection, flood, pieces
+from cotarget.detection.base import Detections, SizeCheck, Tracks, box_detection, flood, pieces
 from cotarget.rig import Frame
-
-if TYPE_CHECKING:
-    from cotarget.tracking.track import Track
 
 # Memory of OpenCV's default mixture, 120 frames at 30 a second, and time from the first frame to the first that is
 # searched: the 13th at 25 a second, the 16th at 30 [s].
@@ -59,7 +54,7 @@ class Mog2Detector:
         self._begun_t: float | None = None
         self._size = SizeCheck()
 
-    def detect(self, frame: Frame, held: Sequence["Track"] = ()) -> Detections:
+    def detect(self, frame: Frame, held: Tracks = ()) -> Detections:
         """Detect moving targets, largest first; the background is learnt everywhere.
 
         Raises:

@@ -9,12 +9,8 @@ It is the half of `cotarget.detection.auto` that finds small targets. Measuremen
 """
 
 from cotarget.detection.small_target.camera_motion import CameraMotion
-from cotarget.detection.small_target.change import History, changes
 from cotarget.detection.small_target.contrast import SmallTarget, find_small_targets
 from cotarget.detection.small_target.finder import SmallTargetFinder
-from cotarget.detection.small_target.score import CLEAR_SIGNAL, WEIGHTS, Weights, evidence, small_target_score
+from cotarget.detection.small_target.score import WEIGHTS, Weights, evidence
 
-__all__ = [
-    "CLEAR_SIGNAL", "WEIGHTS", "CameraMotion", "History", "SmallTarget", "SmallTargetFinder", "Weights", "changes",
-    "evidence", "find_small_targets", "small_target_score",
-]  # fmt: skip
+__all__ = ["WEIGHTS", "CameraMotion", "SmallTarget", "SmallTargetFinder", "Weights", "evidence", "find_small_targets"]

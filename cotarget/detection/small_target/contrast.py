@@ -21,6 +21,8 @@ GUARD_HALF_PX, OUTER_HALF_PX = 7, 11
 SCALES, SCALES_OF_DIFFERENCE = 4, 3
 # How far the largest ring of the difference reaches, and the side of a pixel of its largest scale [px].
 REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES_OF_DIFFERENCE, 2**SCALES_OF_DIFFERENCE
+# Most regions found, and most examined at each scale, the strongest first; bounds the computing time.
+MOST_TARGETS = 40
 # First scale whose ring, 90 px, is so large that a sky's gradient counts.
 SLOPING_SCALE = 2
 # Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
@@ -66,10 +68,8 @@ class SmallTarget:
 def find_small_targets(
     grey: Image,
     threshold: float,
-    most: int,
     *,
     finer: Sequence[Image] = (),
-    scales: int = SCALES,
     of_difference: bool = False,
 ) -> list[SmallTarget]:
     """Find regions that stand out at any scale, without overlaps, the strongest first.
@@ -77,22 +77,20 @@ def find_small_targets(
     Args:
         grey: image, (H, W).
         threshold: least contrast, in standard deviations of the surroundings.
-        most: most regions returned, and most examined at each scale; bounds the computing time.
         finer: images of which ``grey`` is a halving, the finest first; outlines and boxes are in pixels of the first.
-        scales: number of scales.
         of_difference: whether the image is a difference of two, in which dark regions and texture mean nothing.
     """
     levels, first = [*finer, grey], len(finer)
     texture: Image | None = None
     peaks: list[_Peak] = []
-    for scale in range(first, first + scales):
+    for scale in range(first, first + (SCALES_OF_DIFFERENCE if of_difference else SCALES)):
         level = levels[scale]
         if min(level.shape) < 2 * OUTER_HALF_PX:
             break
         levels.append(cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         above = levels[scale - 1] if scale == first and first else None
         sloping, finest = scale - first >= SLOPING_SCALE, scale == 0 and not of_difference
-        peaks += _peaks(level, levels[-1], scale, sloping, threshold, most, above, finest)
+        peaks += _peaks(level, levels[-1], scale, sloping, threshold, above, finest)
         if scale - first == TEXTURE_SCALE and not of_difference:
             texture = cv2.absdiff(level, cv2.blur(level, TEXTURE_PX))
     peaks.sort(key=lambda peak: -peak.signal)
@@ -104,7 +102,7 @@ def find_small_targets(
         target = _outline(levels, peak, of_difference)
         if target is not None and not any(share(target, other) for other in kept):
             kept.append(target)
-            if len(kept) == most:
+            if len(kept) == MOST_TARGETS:
                 break
     if texture is None:
         return kept
@@ -155,7 +153,6 @@ def _peaks(
     scale: int,
     sloping: bool,
     threshold: float,
-    most: int,
     finer: Image | None = None,
     finest: bool = False,
 ) -> list[_Peak]:
@@ -167,7 +164,6 @@ def _peaks(
         scale: number of halvings.
         sloping: whether to fit a plane to the ring, which is so large that a sky's gradient counts.
         threshold: least contrast, in standard deviations of the surroundings.
-        most: most peaks.
         finer: image of twice the size in which targets of one or two pixels are searched too; None for none.
         finest: whether these are searched in this image instead.
     """
@@ -206,7 +202,7 @@ def _peaks(
         )
         peaks.append(_Peak(u, v, scale, signal, around))
     peaks.sort(key=lambda peak: -peak.signal)
-    return peaks[:most]
+    return peaks[:MOST_TARGETS]
 
 
 def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:

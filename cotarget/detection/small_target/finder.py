@@ -16,7 +16,6 @@ from cotarget.detection.small_target.contrast import (
     INNER_PX,
     LEAST_ROUGHNESS,
     REACH_PX,
-    SCALES_OF_DIFFERENCE,
     SmallTarget,
     find_small_targets,
     mostly_in,
@@ -29,15 +28,12 @@ from cotarget.rig import Detection, Frame, Image
 
 # Least contrast, in standard deviations of the surroundings.
 LEAST_SIGNAL = 4.5
-# Most regions examined in a frame, the strongest first; bounds the computing time.
-MOST_TARGETS = 40
 # Steepness of the score of a region of the difference.
 SLOPE = 3.4
 # Least score of a detection. The tracker begins no track with so little; a target that hovers before trees keeps it.
 LEAST_SCORE = 0.005
-# Score from which a region is more likely a target than not.
-BELIEVED_SCORE = 0.5
-# Change from which a region has arrived as a whole; for a sign with a bird flying in front of it, it is a tenth.
+# Score and change from which a region has arrived as a whole: it is more likely a target than not, and half of it was
+# not there before. Of a sign with a bird flying in front of it, a tenth has changed.
 ARRIVED = 0.5
 # Least signal in the difference from all earlier images, and the signal with a score of 0.5. In the simulated field,
 # swaying foliage is above the latter once in six frames, anywhere; a bird in front of it in nineteen of twenty.
@@ -109,7 +105,7 @@ class SmallTargetFinder:
         found: list[Found] = []
         arrived: list[Found] = []
         noisy = times == MOST_TIMES and self._history.noise > LEAST_ROUGHNESS
-        small = find_small_targets(grey, NOISY_SIGNAL if noisy else LEAST_SIGNAL, MOST_TARGETS, finer=finer)
+        small = find_small_targets(grey, NOISY_SIGNAL if noisy else LEAST_SIGNAL, finer=finer)
         for target in [*find_wholes(grey, unit), *small]:
             low = target.low[0] // unit, target.low[1] // unit
             size = -(-target.size[0] // unit), -(-target.size[1] // unit)
@@ -119,7 +115,7 @@ class SmallTargetFinder:
             detection = _boxed(target, score, shape, times)
             if detection.score >= self._least_score:
                 found.append((target, detection))
-            if detection.score >= BELIEVED_SCORE and np.nanmax(since) >= ARRIVED:
+            if detection.score >= ARRIVED and np.nanmax(since) >= ARRIVED:
                 arrived.append((target, detection))
         differing = self._differing(grey, unit, times, shift, references)
         found += [_as_a_whole(pair, arrived) for pair in differing]
@@ -168,13 +164,7 @@ class SmallTargetFinder:
         left, top, right, bottom = (left - REACH_PX, top - REACH_PX, left + width + REACH_PX, top + height + REACH_PX)
         left, top = max(0, left) // ALIGNED_PX * ALIGNED_PX, max(0, top) // ALIGNED_PX * ALIGNED_PX
         found = []
-        for target in find_small_targets(
-            unusual[top:bottom, left:right],
-            LEAST_DIFFERENCE,
-            MOST_TARGETS,
-            scales=SCALES_OF_DIFFERENCE,
-            of_difference=True,
-        ):
+        for target in find_small_targets(unusual[top:bottom, left:right], LEAST_DIFFERENCE, of_difference=True):
             if target.contrast <= 0:
                 continue
             score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE))
