@@ -14,7 +14,7 @@ from cotarget.rig import Frame
 
 # Memory of OpenCV's default mixture, 120 frames at 30 a second, and time from the first frame to the first that is
 # searched: the 13th at 25 a second, the 16th at 30 [s].
-HISTORY_S, WARM_UP_S = 4.0, 0.47
+HISTORY_S, WARM_UP_S = 4.0, 0.5
 # Squared distance to the background, in variances, from which a pixel is foreground.
 THRESHOLD = 25.0
 
