@@ -264,13 +264,19 @@ def _assign(pairs: _Pairs) -> dict[int, int]:
 
 def _merged(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
     """Find detections that cover two or more confirmed tracks: {index of the track: index of the detection}."""
+
+    def is_free(track: int, box: int) -> bool:
+        """Whether a track has no match but this box, or only a piece of its target."""
+        match = matches.get(track, box)
+        return match == box or bool(LARGER * pairs.area_ratio[track, match] < 1)
+
     merged: dict[int, int] = {}
     if sum(pairs.confirmed) < 2:
         return merged
     members = (pairs.covered > pairs.settings.covered) & (pairs.area_ratio < LARGEST_AREA_RATIO)
     inside = members & np.array(pairs.confirmed)[:, None]
     for j in np.flatnonzero(np.count_nonzero(inside, axis=0) > 1):
-        covered = [int(i) for i in np.flatnonzero(inside[:, j]) if matches.get(int(i), j) == j]
+        covered = [i for i in np.flatnonzero(inside[:, j]).tolist() if is_free(i, j)]
         if len(covered) > 1:
             merged |= dict.fromkeys(covered, int(j))
     return merged
