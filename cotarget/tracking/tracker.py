@@ -268,7 +268,7 @@ def _merged(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
     def is_free(track: int, box: int) -> bool:
         """Whether a track has no match but this box, or only a piece of its target."""
         match = matches.get(track, box)
-        return match == box or bool(LARGER * pairs.area_ratio[track, match] < 1)
+        return match == box or bool(pairs.area_ratio[track, match] < pairs.settings.covered)
 
     merged: dict[int, int] = {}
     if sum(pairs.confirmed) < 2:
