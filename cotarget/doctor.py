@@ -252,7 +252,7 @@ def _ask(name: str, ask: Callable[[], str | None], there: str, rig: Path) -> Fin
 
 def _fix(error: CotargetError, name: str, there: str, rig: Path) -> str:
     """Return the command or advice that helps with a device that does not answer as it should."""
-    from cotarget.drivers.axis import LoginError
+    from cotarget.drivers.frame_buffer import LoginError
     from cotarget.drivers.link_errors import InUseError, NoPermissionError
     from cotarget.drivers.ptu_d46 import UncalibratedError
 

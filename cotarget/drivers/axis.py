@@ -18,7 +18,7 @@ from urllib.parse import unquote, urlsplit
 
 from annotated_types import Gt, Interval
 
-from cotarget.drivers.frame_buffer import BufferedCamera, BusyError, FrameBuffer, StreamRefusedError
+from cotarget.drivers.frame_buffer import BufferedCamera, BusyError, FrameBuffer, LoginError, StreamRefusedError
 from cotarget.drivers.mjpeg import MultipartReader, boundary_of, import_simplejpeg
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, install_extra
 from cotarget.rig import CameraSpec, Clock
@@ -85,10 +85,6 @@ class AxisSettings:
     def spec(self) -> CameraSpec:
         """Describe the camera."""
         return CameraSpec(self.size, self.rate_hz, self.latency_s)
-
-
-class LoginError(StreamRefusedError):
-    """The server refuses the user or the password."""
 
 
 class VideoServer:

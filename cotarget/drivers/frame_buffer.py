@@ -1,8 +1,9 @@
 """The newest frame of a camera that is read on a thread of its own.
 
 A consumer that reads a stream itself falls behind: unread frames wait in buffers and grow old. A camera's thread
-therefore takes every frame and puts it into a `FrameBuffer`, which keeps the newest. Its frames may be JPEGs, which are
-decoded only when they are read, so that a slow consumer decodes only the frames that it uses.
+therefore takes every frame and puts it into a `FrameBuffer`, which keeps the newest. Its frames may be JPEGs, or what
+else the buffer's `decode` takes, and are decoded only when they are read, so that a slow consumer decodes only the
+frames that it uses.
 
 A camera driver opens its stream, calls `opened`, and then `put` for each frame. `keep_open` does this again whenever
 the stream ends. Callers get errors from `read`.
@@ -12,6 +13,7 @@ import logging
 import threading
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +41,10 @@ class StreamRefusedError(DeviceError):
     """The camera refuses this stream."""
 
 
+class LoginError(StreamRefusedError):
+    """The camera refuses the user or the password."""
+
+
 @dataclass(frozen=True)
 class FrameCounts:
     """Frame counts of a camera."""
@@ -54,7 +60,7 @@ class FrameCounts:
 class _Newest:
     """The newest frame: as it came, and decoded once it has been read."""
 
-    data: bytes | Image
+    data: Any
     t: float
     arrived: float
     before: float  # arrival of the frame before [s]
@@ -74,12 +80,13 @@ class FrameBuffer:
             refused.
 
     Attributes:
-        decode: decoder of the camera's JPEGs; raises DamagedError.
+        decode: makes the image of what `put` takes in place of an image, by default of a JPEG; raises DamagedError.
     """
 
     def __init__(self, name: str, clock: Clock, size: tuple[int, int], latency_s: float, fresh_s: float) -> None:
         self.name, self._clock, self.size = name, clock, size
-        self._latency_s, self._fresh_s, self.decode = latency_s, fresh_s, StreamDecoder().decode
+        self.latency_s, self._fresh_s = latency_s, fresh_s
+        self.decode: Callable[[Any], Image] = StreamDecoder().decode
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._decoding = threading.Lock()
@@ -151,14 +158,14 @@ class FrameBuffer:
             self._heard_at = self._clock.now()
 
     def put(
-        self, data: bytes | Image, arrived: float, took: float = 0.0, *, t: float | None = None, serial: Hashable = None
+        self, data: Any, arrived: float, took: float = 0.0, *, t: float | None = None, serial: Hashable = None
     ) -> bool:
         """Publish a frame, unless its serial, its own time or else its JPEG is that of the last one.
 
         Equal images without these are new: a video codec repeats the picture of a quiet scene to the last bit.
 
         Args:
-            data: the image, (H, W, 3) BGR, or its JPEG; not changed any more.
+            data: the image, (H, W, 3) BGR, or what `decode` takes, such as its JPEG; not changed any more.
             arrived: time of arrival [s]; the frame's time is this less the latency, where it has no ``t``.
             took: how long the frame took to arrive [s].
             t: middle of the exposure by the stream's own clock, mapped to the rig's [s].
@@ -182,7 +189,7 @@ class FrameBuffer:
             skipped = 1 if self._newest is not None and not self._newest.read else 0
             counts = self._counts
             self._counts = replace(counts, frames=counts.frames + 1, skipped=counts.skipped + skipped)
-            self._newest = _Newest(data, arrived - self._latency_s if t is None else t, arrived, self._new_at)
+            self._newest = _Newest(data, arrived - self.latency_s if t is None else t, arrived, self._new_at)
             self._new_at = arrived
             self._frozen, self._refused, self._remark, self._lost = False, "", "", ""
             self._changed.notify_all()
