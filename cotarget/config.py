@@ -767,6 +767,10 @@ def config_table(config: RigConfig) -> dict[str, Any]:
     return table | ({"hardware": devices} if devices else {})
 
 
+# A password in the path or query of an address, as some cameras want it.
+SECRET = re.compile(r"((?:pass|pwd|pw)\w*=)[^&]*", re.IGNORECASE)
+
+
 def _without_secrets(table: Mapping[str, Any]) -> dict[str, Any]:
     """Leave out a device's password, and the login in an address."""
     kept = {key: value for key, value in table.items() if key != "password"}
@@ -778,4 +782,5 @@ def _without_login(text: str) -> str:
         url = urlsplit(text)
     except ValueError:  # no address
         return text
-    return url._replace(netloc=url.netloc.rpartition("@")[2]).geturl() if "@" in url.netloc else text
+    text = url._replace(netloc=url.netloc.rpartition("@")[2]).geturl() if "@" in url.netloc else text
+    return SECRET.sub(r"\1***", text) if url.netloc else text
