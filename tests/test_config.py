@@ -250,7 +250,7 @@ def test_refused_value_of_hardware_is_named_by_its_key(key, value):
 
 
 def test_an_unknown_driver_is_refused_with_the_valid_ones():
-    assert refused_hardware("hardware.fixed.driver = 'axes'").endswith(": axis")
+    assert refused_hardware("hardware.fixed.driver = 'axes'").endswith(": axis, stream")
 
 
 @pytest.mark.parametrize("backend", ["hardware", "sim"])

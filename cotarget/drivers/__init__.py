@@ -6,7 +6,7 @@ from collections.abc import Mapping
 # class is imported when a rig.toml names it, and the device's library when the device is opened. A table without names
 # takes a driver of a user's own.
 DRIVERS: Mapping[str, Mapping[str, str]] = {
-    "fixed": {"axis": "cotarget.drivers.axis:AxisCamera"},
+    "fixed": {"axis": "cotarget.drivers.axis:AxisCamera", "stream": "cotarget.drivers.stream:StreamCamera"},
     "zoom": {"gphoto2": "cotarget.drivers.gphoto_camera:GphotoCamera"},
     "head": {"ptu_d46": "cotarget.drivers.ptu_d46:D46Head"},
     "ptz": {},

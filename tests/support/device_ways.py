@@ -8,6 +8,7 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 from cotarget.backends import open_recording
@@ -16,6 +17,7 @@ from cotarget.drivers.axis import AxisCamera, AxisSettings
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.gphoto_camera import GphotoCamera, GphotoSettings
 from cotarget.drivers.ptu_d46 import D46Head
+from cotarget.drivers.stream import StreamCamera, StreamSettings
 from cotarget.errors import DeviceError
 from cotarget.recording.recorder import Recorder
 from cotarget.recording.replay import Replay
@@ -25,6 +27,7 @@ from tests.support.gphoto_link import CONFIG as GPHOTO_CONFIG
 from tests.support.gphoto_link import FakeLink
 from tests.support.plants import FEED_SIZE, PASSWORD, USER, D46Unit, axis_server, s5is_process
 from tests.support.recorded_run import calibration_file
+from tests.support.rtsp_server import Feed, RtspServer
 
 CONFIG = parse_config({"sim": {"scene": "indoor", "targets": ["book"]}})
 PATIENT = SafetyConfig(watchdog_s=30.0, stop_file=None)  # a contract reads no frames while a head moves
@@ -90,6 +93,16 @@ def axis():
 
 
 @contextlib.contextmanager
+def rtsp():
+    random = np.random.default_rng(0)
+    feed = Feed(lambda index: random.integers(0, 255, (FEED_SIZE[1], FEED_SIZE[0], 3), dtype=np.uint8))
+    with RtspServer(feed) as server:
+        settings = StreamSettings(url=server.url, size=FEED_SIZE)
+        with contextlib.closing(StreamCamera(settings, MonotonicClock())) as camera:
+            yield camera, MonotonicClock()
+
+
+@contextlib.contextmanager
 def s5is():
     with (
         s5is_process() as process,
@@ -114,7 +127,7 @@ def d46(tcp=False):
 
 WIRE = pytest.mark.wire
 ZOOM_CAMERAS = [*of_rigs("zoom"), way("gphoto2", gphoto2), way("emulated S5 IS", s5is, WIRE)]
-CAMERAS = [*of_rigs("fixed"), *ZOOM_CAMERAS, way("emulated 241Q", axis, WIRE)]
+CAMERAS = [*of_rigs("fixed"), *ZOOM_CAMERAS, way("emulated 241Q", axis, WIRE), way("RTSP", rtsp, WIRE)]
 HEADS = [
     *of_rigs("head"),
     way("emulated PTU-D46", d46, WIRE),
