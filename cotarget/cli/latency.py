@@ -68,6 +68,10 @@ def run(options: argparse.Namespace) -> None:
                 return rig.spec.fixed.latency_s + fixed.seconds + head.zoom.seconds
 
             keep(f"{where}.fixed.latency_s", measure)
+        for name, table in (("fixed", f"{where}.fixed"), ("zoom", zoom_table)):
+            of_stream = getattr(getattr(rig, name), "describe", None)
+            if name not in rig.missing and of_stream is not None and (said := of_stream()):
+                print(f"{table}: {said}", file=sys.stderr)
     if calibration is None:
         print("the fixed camera's latency needs --calibration, to look at a board with both cameras", file=sys.stderr)
     if head.late:

@@ -125,6 +125,11 @@ class SafeCamera:
         """(width, height) [px]."""
         return self._camera.size
 
+    def describe(self) -> str:
+        """Describe the camera's stream in one line; empty where its driver does not measure it."""
+        describe: Callable[[], str] | None = getattr(self._camera, "describe", None)
+        return "" if describe is None else describe()
+
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
         """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
 
