@@ -129,6 +129,8 @@ DRIFT = 1e-4
 LATE_S, LATE_FOR_S = 0.5, 3.0
 # The stream has no backlog where the thread waited so long for a packet [s].
 WAITED_S = 1e-3
+# A machine with a longer backlog decodes too slowly, and goes on at the next key frame [s].
+BACKLOG_S = 2.0
 
 
 class StreamClock:
@@ -256,7 +258,7 @@ class StreamReader:
             self._measure(picture, arrived, own, waited)
             t = self._times.map(own, arrived, waited) - self._frames.latency_s
             self._frames.put(picture, arrived, t=t, serial=picture.pts)
-            if self._times.late_s > LATE_S and not waited:
+            if self._times.late_s > BACKLOG_S and not waited:
                 self._wait_for_key(arrived, f"this machine decodes {self._frames.name} too slowly, and skips pictures")
 
     def _wait_for_key(self, now: float, why: str) -> None:
@@ -423,7 +425,7 @@ class StreamCamera(BufferedCamera):
 
     def _drain(self, container: Any) -> None:
         if not container.streams.video or container.streams.video[0].codec_context is None:
-            raise StreamRefusedError(f"{self._name} has no pictures that can be decoded: check hardware.fixed.url")
+            raise StreamRefusedError(f"{self._name} has no pictures that can be decoded: check its url")
         stream, clock = container.streams.video[0], self._clock
         has_times = container.format.name not in WITHOUT_CLOCK
         reader = self._reader = StreamReader(self._frames, stream.codec_context, clock, has_times)
@@ -455,18 +457,18 @@ class StreamCamera(BufferedCamera):
         match error:
             case errors.HTTPUnauthorizedError() | errors.HTTPForbiddenError():
                 given = config.password or environ.get(config.password_env)
-                missing = "" if config.user else "hardware.fixed.user and "
+                missing = "" if config.user else "user and "
                 remedy = "check" if config.user and given else "set"
                 return LoginError(
                     f"{name} refuses the user '{config.user}': {remedy} {missing}the password, which may be in the "
                     f"environment variable {config.password_env}"
                 )
             case errors.HTTPNotFoundError():
-                return StreamRefusedError(f"{name} has no such stream (404): check the path in hardware.fixed.url")
+                return StreamRefusedError(f"{name} has no such stream (404): check the path in its url")
             case errors.HTTPServerError():
                 return BusyError(f"{name} is busy, perhaps with too many viewers: close some, or restart it")
             case errors.HTTPClientError():
-                return StreamRefusedError(f"{name} refuses the stream ({why}): check hardware.fixed.url")
+                return StreamRefusedError(f"{name} refuses the stream ({why}): check its url")
             case errors.ExitError() | TimeoutError():
                 return DeviceError(f"{name} has sent nothing for {self._limits[1]:.0f} s: check its power and network")
             case errors.ArgumentError() | errors.InvalidDataError() | OSError(errno=errno.EIO) if (
@@ -474,10 +476,10 @@ class StreamCamera(BufferedCamera):
             ):
                 return StreamRefusedError(
                     f"{name} is no stream that is read, but perhaps a playlist, a page or a redirection: give the "
-                    "stream's own address in hardware.fixed.url"
+                    "stream's own address as url"
                 )
-        keys = "url and hardware.fixed.transport" if self._kind is RTSP else "url"
-        return DeviceError(f"{name} cannot be read ({why}): check hardware.fixed.{keys}, its power and network")
+        keys = "url, transport" if self._kind is RTSP else "url"
+        return DeviceError(f"{name} cannot be read ({why}): check {keys}, its power and the network")
 
 
 def refuse_redirection(url: str, name: str) -> None:
@@ -507,6 +509,4 @@ def refuse_redirection(url: str, name: str) -> None:
     if re.match(r"RTSP/1\.\d 3\d\d", answer):
         found = re.search(r"^location:\s*(\S+)", answer, re.IGNORECASE | re.MULTILINE)
         to = urlsplit(found[1]).netloc.rpartition("@")[2] if found else ""
-        raise StreamRefusedError(
-            f"{name} sends on to {to or 'another address'}: set hardware.fixed.url to where the stream really is"
-        )
+        raise StreamRefusedError(f"{name} sends on to {to or 'another address'}: set url to where the stream really is")

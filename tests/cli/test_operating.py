@@ -209,6 +209,17 @@ def test_latency_prints_what_it_found_though_one_value_failed(folder, capsys, mo
     assert "sim.fixed.latency_s: the board is out of reach" in err
 
 
+def test_latency_describes_a_stream(folder, capsys, monkeypatch):
+    devices = SimulatedDevices()
+    monkeypatch.setattr(devices.fixed, "describe", lambda: "640x480 h264, 25.0 frames a second", raising=False)
+    monkeypatch.setattr("cotarget.latency.measure_head", lambda rig: HeadLatency(Delay(0.0, 0.99), 0.04, 100))
+    monkeypatch.setitem(OPENERS, "sim", lambda *_: rig_of(devices))
+    status, _, err = call(capsys, "latency", "--rig", "sim.toml")
+    assert status == 0
+    assert "sim.fixed: 640x480 h264, 25.0 frames a second" in err.splitlines()
+    assert "sim.zoom: " not in err
+
+
 @pytest.fixture
 def resets(monkeypatch):
     """Serial ports whose heads would have been reset."""

@@ -223,13 +223,16 @@ def test_pictures_in_another_order_keep_their_times():
     np.testing.assert_allclose(steps * RATE_HZ, np.round(steps * RATE_HZ), atol=0.01)
 
 
+BACKLOG_S = 3.0
+
+
 def test_a_machine_that_decodes_too_slowly_skips_to_the_next_key_frame():
     bench = Bench(Feed(draw, group=10))
     bench.send(5)
-    bench.begin += 2.0  # from here on a backlog
+    bench.begin += BACKLOG_S  # from here on
     bench.send(1, waited=False)
     t = bench.frames.read().t
-    assert bench.clock.t - t == pytest.approx(2.0 + LATENCY_S, abs=0.01)  # its time tells how old it is
+    assert bench.clock.t - t == pytest.approx(BACKLOG_S + LATENCY_S, abs=0.01)  # its time tells how old it is
     bench.send(4, waited=False)
     assert bench.frames.read().t == t
     assert "too slowly" in bench.why()
@@ -352,7 +355,7 @@ def test_a_wrong_password_is_an_error_that_does_not_show_it(caplog):
     caplog.set_level(logging.DEBUG)
     with RtspServer(Feed(draw, login=True)) as server:
         for given, remedy in (
-            ({}, "set hardware.fixed.user and the password"),
+            ({}, "set user and the password"),
             ({"user": USER}, "set the password"),
             ({"user": USER, "password": "hunter1"}, "check the password"),
         ):
@@ -366,7 +369,7 @@ ANSWERS = {
     "elsewhere": ({"DESCRIBE": ("302 Moved", ["Location: rtsp://a:b@192.0.2.9/x"])}, "sends on to 192.0.2.9:"),
     "no such stream": ({"DESCRIBE": ("404 Not Found", [])}, "404"),
     "forbidden": ({"SETUP": ("403 Forbidden", [])}, "refuses the user"),
-    "another transport": ({"SETUP": ("461 Unsupported Transport", [])}, "hardware.fixed.transport"),
+    "another transport": ({"SETUP": ("461 Unsupported Transport", [])}, "check url, transport"),
     "busy": ({"PLAY": ("503 Service Unavailable", [])}, "viewers"),
 }
 
@@ -386,6 +389,15 @@ def test_an_address_where_nobody_answers_is_an_error_of_one_line():
     assert "cannot be reached" in refused("rtsp://camera.invalid/s")
     assert "Connection refused" in refused("http://127.0.0.1:1/s")
     assert "No such file" in refused("no_film.mp4")
+
+
+@wire
+def test_a_probe_looks_until_it_has_seen_the_groups_of_pictures(monkeypatch):
+    monkeypatch.setattr(stream, "PROBE_S", 0.2)
+    with RtspServer(Feed(draw)) as server:
+        said = device_of("fixed", {"driver": "stream", "url": server.url, "size": [320, 240]}).probe()
+    for part in ("320x240 h264", "frames a second", "a key frame every 10 frames", "late by the camera's time of day"):
+        assert part in said
 
 
 @wire
