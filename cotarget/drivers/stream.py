@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import environ
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 from urllib.parse import quote, urlsplit
 
@@ -185,6 +186,8 @@ class StreamClock:
 # Pictures
 
 KEY_ADVICE = "set its key frame interval (GOP, I-frame interval) to one second and switch smart codecs off"
+LOSS_ADVICE = "check its network, and that transport is tcp"
+SLOW_ADVICE = "set a smaller size or rate in it, or H.264"
 
 
 def to_bgr(picture: av.VideoFrame) -> Image:
@@ -218,8 +221,8 @@ class StreamReader:
         self._frames, self._codec, self._clock, self._has_times = frames, codec, clock, has_times
         codec.thread_type = "SLICE"  # threads by frame add a frame of delay each
         self._times = StreamClock()
-        self._key_since: float | None = clock.now()  # begin of the wait for a key frame [s]
-        self._key_reason = f"{frames.name} has sent no key frame"
+        self._key_since: float | None = None  # begin of the wait for a key frame [s]
+        self._wait_for_key(clock.now(), f"{frames.name} has sent no key frame", KEY_ADVICE)
         self._arrivals: deque[_Arrival] = deque(maxlen=MEASURED)
         self._size = (0, 0)
         self._key_picture, self._same_since, self._frozen_s = 0, 0.0, 0.0
@@ -231,11 +234,12 @@ class StreamReader:
         if not packet.size and packet.dts is not None:  # it repeats the picture before; the very last one has no time
             return
         if self._key_since is not None and packet.size:
+            reason = f"{self._key_reason} for {arrived - self._key_since:.1f} s: {self._key_advice}"
             if not packet.is_keyframe:
-                self._frames.remark(f"{self._key_reason} for {arrived - self._key_since:.1f} s: {KEY_ADVICE}")
+                self._frames.remark(reason)
                 return
             if arrived - self._key_since > LONG_WAIT_S:
-                log.warning("%s for %.1f s: %s", self._key_reason, arrived - self._key_since, KEY_ADVICE)
+                log.warning("%s", reason)
             self._key_since = None
         try:
             pictures = self._codec.decode(packet if packet.size else None)
@@ -244,7 +248,7 @@ class StreamReader:
             is_damaged = True
         if is_damaged:  # what follows would be smeared
             self._frames.refuse()
-            self._wait_for_key(arrived, f"{self._frames.name} has sent a broken picture, and no key frame")
+            self._wait_for_key(arrived, f"{self._frames.name} has sent a broken picture, and no key frame", LOSS_ADVICE)
             return
         for picture in pictures:
             self._put(picture, packet, arrived, waited)
@@ -259,10 +263,10 @@ class StreamReader:
             t = self._times.map(own, arrived, waited) - self._frames.latency_s
             self._frames.put(picture, arrived, t=t, serial=picture.pts)
             if self._times.late_s > BACKLOG_S and not waited:
-                self._wait_for_key(arrived, f"this machine decodes {self._frames.name} too slowly, and skips pictures")
+                self._wait_for_key(arrived, f"this machine skips pictures of {self._frames.name}", SLOW_ADVICE)
 
-    def _wait_for_key(self, now: float, why: str) -> None:
-        self._key_since, self._key_reason = now, why
+    def _wait_for_key(self, now: float, reason: str, advice: str) -> None:
+        self._key_since, self._key_reason, self._key_advice = now, reason, advice
 
     def _measure(self, picture: Any, arrived: float, own: float | None, waited: bool) -> None:
         """Measure with a picture; warn of one that stays the same from key frame to key frame."""
@@ -302,7 +306,7 @@ class StreamReader:
             parts.append(f"fewer than two key frames in {times[-1] - times[0]:.0f} s: {KEY_ADVICE}")
         parts += self._delays(seen)
         if self._times.jumps:
-            parts.append(f"its clock has jumped {self._times.jumps} times")
+            parts.append(f"jumps of its clock: {self._times.jumps}")
         if self._frozen_s > FROZEN_S:
             parts.append(f"the same picture for {self._frozen_s:.1f} s")
         return ", ".join(parts)
@@ -412,13 +416,15 @@ class StreamCamera(BufferedCamera):
             with contextlib.suppress(av.FFmpegError):
                 jpeg = options | {"input_format": "mjpeg"}
                 return av.open(config.url, format="v4l2", options=jpeg, timeout=self._limits)
-        form = "v4l2" if kind is V4L2 else None
-        return av.open(self._login(), format=form, options=options, timeout=self._limits)
+            return av.open(config.url, format="v4l2", options=options, timeout=self._limits)
+        return av.open(self._address(), options=options, timeout=self._limits)
 
-    def _login(self) -> str:
-        """Return the address with user and password."""
+    def _address(self) -> str:
+        """Return the address for FFmpeg, with user and password."""
         config, parts = self._config, urlsplit(self._config.url)
-        if not (config.user and parts.scheme in KINDS):
+        if self._kind is FILM:  # what leads a colon in a relative path would be taken for a protocol
+            return str(Path(config.url).absolute())
+        if not config.user:
             return config.url
         password = config.password or environ.get(config.password_env, "")
         return parts._replace(netloc=f"{quote(config.user, '')}:{quote(password, '')}@{parts.netloc}").geturl()

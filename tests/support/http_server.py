@@ -67,6 +67,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                     self.wfile.write(part)
                     if server.closing.wait(1 / RATE_HZ):
                         return
+            while page == "endless" and not server.closing.is_set():
+                self.wfile.write(bytes(100_000))
             self.wfile.write(server.LISTS.get(page, b"").replace(b"ELSEWHERE", server.url("visited").encode()))
 
     def log_message(self, *_):
