@@ -269,9 +269,8 @@ class FrameBuffer:
                     raise self._hopeless
                 newest = self._newest
                 if newest is None:
-                    raise DeviceError(
-                        self._lost or self._refused or f"{self.name} has sent no whole picture in {timeout:g} s"
-                    )
+                    none = f"{self.name} has sent no whole picture in {timeout:g} s"
+                    raise DeviceError(self._lost or self._remark or self._refused or none)
             if (image := self._decode(newest)) is not None:
                 return image.shape[1], image.shape[0]
 

@@ -401,6 +401,16 @@ def test_a_probe_looks_until_it_has_seen_the_groups_of_pictures(monkeypatch):
 
 
 @wire
+def test_a_camera_that_sends_no_key_frame_is_named(monkeypatch):
+    monkeypatch.setattr(stream, "OPEN_S", 0.5)
+    monkeypatch.setattr(stream, "FIRST_S", 2.0)
+    with RtspServer(Feed(draw, skip=1, group=1000)) as server:
+        said = refused(server.url)
+    assert "has sent no key frame for" in said
+    assert "key frame interval" in said
+
+
+@wire
 def test_another_size_is_named():
     with RtspServer(Feed(draw)) as server:
         assert "write size = [320, 240]" in refused(server.url, ConfigError, size=(640, 480))
