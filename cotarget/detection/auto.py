@@ -34,8 +34,8 @@ PLAIN = 5.0
 # Part of a large target that a small one covers if they are the same target; one of which the large target covers less
 # than 1 - SAME is much larger.
 SAME = 0.6
-# A track follows a small target if their larger sides differ by less than this factor. Inside a large target whose area
-# is larger by more than its square, it is then another target, such as a bird before a cloud.
+# Targets and tracks are alike if their larger sides differ by less than this factor. A small target that one follows
+# is no part of a large one whose area is larger by more than the square, but a bird before a cloud.
 SIDE_RATIO = 2.0
 # Part of a small target inside a large one from which it is a part of it.
 INSIDE = 0.5
@@ -46,8 +46,9 @@ HELD_MARGIN, HELD_PART = 0.2, 2 / 640
 # Logarithm of width over height: standard deviation of targets about the expected one, as persons who walk have, and of
 # anything about a square; and part of the targets that may have any shape, such as a person who lies.
 SHAPE_SIGMA, OTHER_SIGMA, OTHER_PART = 0.5, 1.0, 0.2
-# Clutter: number of cells along the image's width, memory [s], and the usual score that halves a target's odds.
-CELLS, CLUTTER_S, CLUTTER_EVEN = 80, 10.0, 0.03
+# Clutter: number of cells along the image's width, memory [s], and what halves a target's odds: the usual score at its
+# place, and the sum of the scores of others of its size, as of raindrops.
+CELLS, CLUTTER_S, CLUTTER_EVEN, CROWD_EVEN = 80, 10.0, 0.03, 3.0
 # Largest weight of one image in the clutter map: the first after a pause does not empty it.
 MOST_GAIN = 0.1
 
@@ -152,9 +153,7 @@ class AutoDetector:
             (track.center_px + (t - track.t) * track.velocity_px, track.size_px + margin) for track in self._tracks
         ]
         near = _within(small, places)
-        sides = np.log([each.size_px.max() for each in small]), np.log([each.size_px.max() for each in self._tracks])
-        alike = np.abs(np.subtract.outer(*sides)) < np.log(SIDE_RATIO)
-        return (near & alike).any(axis=1).tolist()
+        return list(np.any(near & _alike(small, self._tracks), axis=1).tolist())
 
     def _hold(self, tracks: Tracks, width: int) -> None:
         """Do not learn the background under the confirmed ones of the last image's tracks."""
@@ -183,6 +182,12 @@ def _mask(background: Detections, apart: Sequence[Detection]) -> Image:
     return np.asarray(cv2.max(boxes, large), dtype=np.uint8)
 
 
+def _alike(some: Sequence[Detection], others: Sequence[Detection] | Tracks) -> npt.NDArray[np.bool_]:
+    """Whether the larger sides of each pair differ by less than SIDE_RATIO, (some, others)."""
+    sides = [np.log([each.size_px.max() for each in group]) for group in (some, others)]
+    return np.asarray(np.abs(np.subtract.outer(*sides)) < np.log(SIDE_RATIO))
+
+
 class Clutter:
     """Mean score of small targets at each place, as a clutter map of radar: high where a twig sways."""
 
@@ -198,7 +203,7 @@ class Clutter:
     def weigh(
         self, found: Sequence[Detection], t: float, width: int, held: Sequence[tuple[Array, Array]]
     ) -> list[Detection]:
-        """Lower the scores of targets where there usually is one, and remember this image.
+        """Lower the scores of targets where one usually is, or many are alike, and remember this image.
 
         Args:
             found: small targets.
@@ -214,12 +219,15 @@ class Clutter:
             self._usual, self._t = np.zeros((2 * CELLS, CELLS)), t
         now = np.zeros_like(self._usual)
         weighed = []
-        for each, is_held in zip(found, np.any(_within(found, held), axis=1), strict=True):
-            if not is_held:
+        is_free = ~np.any(_within(found, held), axis=1)
+        scores = is_free * [each.score for each in found]
+        crowds = _alike(found, found) @ scores - scores
+        for each, free, crowd in zip(found, is_free.tolist(), crowds.tolist(), strict=True):
+            if free:
                 u, v = np.clip(each.center_px / side, 0, (CELLS - 1, 2 * CELLS - 1)).astype(int).tolist()
                 nearby = now[max(0, v - 1) : v + 2, max(0, u - 1) : u + 2]
                 np.maximum(nearby, each.score, out=nearby)
-                even = each.score / (1 + float(self._usual[v, u]) / CLUTTER_EVEN)
+                even = each.score / (1 + float(self._usual[v, u]) / CLUTTER_EVEN + crowd / CROWD_EVEN)
                 each = replace(each, score=even / (even + 1 - each.score))
             weighed.append(each)
         self._usual += np.clip((t - self._t) / CLUTTER_S, 0.0, MOST_GAIN) * (now - self._usual)

@@ -276,7 +276,7 @@ def _merged(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
     members = (pairs.covered > pairs.settings.covered) & (pairs.area_ratio < LARGEST_AREA_RATIO)
     inside = members & np.array(pairs.confirmed)[:, None]
     for j in np.flatnonzero(np.count_nonzero(inside, axis=0) > 1):
-        covered = [i for i in np.flatnonzero(inside[:, j]).tolist() if is_free(i, j)]
+        covered = [i for i in np.flatnonzero(inside[:, j]).tolist() if is_free(i, int(j))]
         if len(covered) > 1:
             merged |= dict.fromkeys(covered, int(j))
     return merged
