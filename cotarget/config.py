@@ -8,10 +8,11 @@ The types of the fields say what a value may be, see `cotarget.schema`. `check_c
 values that make no sense.
 """
 
+import math
 import re
 import tomllib
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -508,13 +509,63 @@ class TargetProfile:
         """Whether the dimension shows as the largest size over some time, as a wingspan does over a wing beat."""
         return self.dimension == "wingspan"
 
-    def is_vertical(self, width: float = 1.0, height: float = 1.0) -> bool:
-        """Whether the dimension is the height of a box of a given width and height, and not its width."""
-        return self.dimension == "height" or (self.dimension == "wingspan" and height > width)
+    def is_vertical(self) -> bool:
+        """Whether the dimension is a height, along the vertical, and not across it."""
+        return self.dimension == "height"
 
-    def sides(self, shape: float) -> tuple[float, float]:
-        """Width and height of a box of a given width over height, relative to the dimension."""
-        return (shape, 1.0) if self.is_vertical(shape) else (1.0, 1 / shape)
+    def turn(self, width: float, height: float, roll: float) -> float:
+        """Find the angle from the image's v axis to the target's own vertical axis, by the shape of its box [rad].
+
+        The axis lies between the v axis and the head's pan axis, because either may be the vertical: a camera may be
+        mounted sideways, or the head. The box of an ellipse of the usual shape tells where; without a usual shape, and
+        for a template, whose box does not turn with it, it is the pan axis.
+
+        Args:
+            width: width of the box, above 0.
+            height: height of the box, in the same unit, above 0.
+            roll: angle from the v axis to the pan axis, as the image shows it, within a quarter turn [rad].
+        """
+        if self._slimness is None:
+            return roll
+        box, usual, slim = (width / height) ** 2, self._slimness**2, math.copysign(1.0, 1 - self._slimness)
+        over, under = slim * (box - usual), slim * (1 - box * usual)
+        turned = 0.0 if over <= 0 else math.atan2(math.sqrt(over), math.sqrt(max(under, 0.0)))
+        return math.copysign(min(turned, abs(roll)), roll)
+
+    def length(self, width: float, height: float, roll: float = 0.0) -> float:
+        """Measure the dimension along the target's own axis, by its box; arguments as for `turn`.
+
+        A wingspan is the larger side in any camera: over a wing beat, a box of spread wings is as large across.
+        """
+        if self.dimension == "wingspan":
+            return max(width, height)
+        turn = self.turn(width, height, roll)
+        c, s = math.cos(turn), abs(math.sin(turn))
+        along, other = (height, width) if self.is_vertical() else (width, height)
+        nearest, c, s = (along, c, s) if c >= s else (other, s, c)
+        if self._slimness is None:
+            return nearest
+        across = self._slimness if self.is_vertical() else 1 / self._slimness
+        return nearest / math.hypot(c, across * s)
+
+    @property
+    def _slimness(self) -> float | None:
+        """Usual width over height of an elliptic outline; None where boxes show no roll."""
+        return None if self.matcher == "box" or self.shape == 1 else self.shape
+
+    def sides(self, shape: float, roll: float = 0.0) -> tuple[float, float]:
+        """Width and height of a box of a given width over height, relative to the dimension; roll as for `turn`."""
+        length = self.length(shape, 1.0, roll)
+        return shape / length, 1.0 / length
+
+    def turned(self, sides: Pair, turn: Sequence[Sequence[float]]) -> tuple[float, float]:
+        """Width and height of the box of the same outline, turned in the image by a matrix, (2, 2)."""
+        across, down = sides
+        if self.matcher == "box":  # corners
+            width, height = (abs(a) * across + abs(b) * down for a, b in turn)
+        else:
+            width, height = (math.hypot(a * across, b * down) for a, b in turn)
+        return width, height
 
 
 DEFAULT_TARGETS: Mapping[str, TargetProfile] = types.MappingProxyType(

@@ -225,7 +225,7 @@ def _closeup(truth: Appearances, name: str, target: TargetProfile, t: float, out
     u, v = truth.center_px(name, "zoom", t).tolist()
     size = math.nan
     if outline is not None:
-        width, height = outline.size_px.tolist()
+        width, height = outline.upright_px.tolist()
         if target.largest_over_time:
             size = truth.largest_side_px(name, "zoom", t)
         else:

@@ -380,7 +380,8 @@ class TargetFusion:
                     continue
                 box, sigma_px = replace(track.box, center_px=view.body_px), view.body_sigma_px
                 if self._profile.matcher == "upright":  # a box without the feet has its middle too high
-                    sigma_px = np.hypot(sigma_px, [0.0, abs(box.size_px[1] - track.size_px[1]) / 2])
+                    upright = np.array([math.sin(view.turn), math.cos(view.turn)])
+                    sigma_px = np.hypot(sigma_px, upright * (box.size_px - track.size_px) / 2)
         target.filter.add_fixed(box, frame.t, sigma_px=sigma_px, size_px=size_px)
 
 

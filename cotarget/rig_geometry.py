@@ -4,6 +4,8 @@ A fit estimates these classes, a calibration file holds them, and aiming, tracki
 frames see `cotarget.geometry`.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -93,6 +95,40 @@ class ZoomHead:
         x, y, z = x_fixed
         return np.asarray(self._base_fixed @ np.array((x, y, z, 1.0)))
 
+    @cached_property
+    def _vertical_fixed(self) -> list[float]:
+        """Direction of the pan axis, downwards, in the fixed camera's frame, (3,)."""
+        return list(self._base_fixed[1, :3].tolist())
+
+    def fixed_roll(self, x: float, y: float) -> float:
+        """Compute the angle from the fixed image's v axis to the pan axis, as it appears at tangents x, y [rad].
+
+        It is within a quarter turn, because no target's size tells up from down.
+        """
+        right, down, ahead = self._vertical_fixed
+        return _within_quarter(right - x * ahead, down - y * ahead)
+
+    @cached_property
+    def zoom_roll(self) -> float:
+        """Angle from the zoom image's v axis to the pan axis, as it appears in its centre, within a quarter turn [rad].
+
+        It changes with the tilt by less than the zoom camera leans against the head.
+        """
+        right, down, _ = self.hand_eye().rotation.as_matrix()[1].tolist()
+        return _within_quarter(right, down)
+
+    def focal_along(self, focal_px: Sequence[float], *, vertical: bool) -> float:
+        """Compute the zoom camera's focal length along or across the pan axis [px], from those along u and v."""
+        fx, fy = focal_px
+        c, s = math.cos(self.zoom_roll), math.sin(self.zoom_roll)
+        return math.hypot(fx * s, fy * c) if vertical else math.hypot(fx * c, fy * s)
+
+    def room_px(self, size: tuple[int, int], *, vertical: bool) -> float:
+        """Compute the longest line along or across the pan axis in a zoom image of a size (width, height) [px]."""
+        c, s = abs(math.cos(self.zoom_roll)), abs(math.sin(self.zoom_roll))
+        across, down = (s, c) if vertical else (c, s)
+        return min(side / part if part > 0 else math.inf for side, part in zip(size, (across, down), strict=True))
+
     def T_fixed_zoom(self, pan: float, tilt: float) -> RigidTransform:
         """Compute the zoom camera's pose, at the shortest focal length and reported pan and tilt [rad] (Eq. 2)."""
         return zoom_fixed(pan, tilt, self.hand_eye(), self.T_zoom0_fixed, self.axes).inv()
@@ -116,3 +152,8 @@ class ZoomHead:
     def resized(self, size: tuple[int, int]) -> "ZoomHead":
         """Return the same camera and head for a stream scaled to another size (width, height) [px]."""
         return replace(self, lens=self.lens.resized(size))
+
+
+def _within_quarter(right: float, down: float) -> float:
+    """Compute the angle from the v axis to a line, given by a direction in the image, within a quarter turn [rad]."""
+    return math.atan2(right, down) if down >= 0 else math.atan2(-right, -down)

@@ -148,14 +148,15 @@ def target_implausibility(target: TargetProfile, calibration: Calibration, spec:
     if text := size_implausibility(target, name):
         return text
     where = f"targets.{name}" if name else "target"
-    along = 1 if target.is_vertical() else 0
-    room_px = max(spec.zoom.size) if target.largest_over_time else spec.zoom.size[along]
+    room_px = calibration.zoom_head.room_px(spec.zoom.size, vertical=target.is_vertical())
+    room_px = max(spec.zoom.size) if target.largest_over_time else room_px
     if target.wanted_px > room_px:
         width, height = spec.zoom.size
         return (
             f"{where}.wanted_px: {target.wanted_px:g} px does not fit into the zoom camera's {width}x{height} image; "
-            f"give less than {room_px}"
+            f"give less than {room_px:.0f}"
         )
+    along = 1 if target.is_vertical() else 0
     # The nearest target fills the fixed image, and the longest focal length shows it largest.
     fixed = calibration.fixed.lens.resized(spec.fixed.size)
     longest = calibration.zoom_head.lens.resized(spec.zoom.size).at(spec.zoom.focal_range[1])
@@ -265,9 +266,8 @@ def aim(
         if wanted_size:
             z = float(pointing.range * ray[2]) / math.hypot(*ray)
             focal = focal_for_size(wanted_size.size, wanted_size.wanted_px, z)  # Eq. 17
-            if wanted_size.vertical:  # this focal length is fy, and the lens is commanded by fx
-                fx, fy = lens.focal_px
-                focal *= fx / fy
+            # This focal length is along the size, and the lens is commanded by fx.
+            focal *= lens.focal_px[0] / head.focal_along(lens.focal_px, vertical=wanted_size.vertical)
             previous = nominal
             nominal, limited = _limit(zoom.nominal_for(focal), reach)
             if nominal != previous:

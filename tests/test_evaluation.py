@@ -210,7 +210,7 @@ def test_a_row_holds_the_true_angles_of_the_head(moving):
 @pytest.mark.parametrize(("dimension", "axis"), [("width", 0), ("height", 1)])
 def test_the_size_is_that_of_the_targets_dimension(book, dimension, axis):
     target = dataclasses.replace(book.config.target("book"), dimension=dimension)
-    sides = book.truth().silhouette("book", "zoom", 0.0).size_px
+    sides = book.truth().silhouette("book", "zoom", 0.0).upright_px
     assert sides[0] != sides[1]
     assert closeup_of(book.truth(), "book", target, 0.0).size_px == sides[axis]
 

@@ -88,7 +88,7 @@ def test_the_exact_aim_brings_the_target_to_the_wanted_pixel(real_head, pixel):
 
 
 def test_the_closeup_is_as_large_as_wanted():
-    """Two points, a target's width apart and square to the zoom camera's axis, appear the wanted size apart."""
+    """Two points, a target's width apart, square to pan axis and line of sight, appear the wanted size apart."""
     rng = np.random.default_rng(4)
     for _ in range(10):
         truth = replace(random_truth(rng, True), zoom=Lens(692.0, 693.0, 326.0, 235.0))
@@ -96,7 +96,8 @@ def test_the_closeup_is_as_large_as_wanted():
         found = aim(calibration_of(truth), x_fixed, ANYWHERE, wanted_size=WantedSize(0.234, 160.0))
         assert not found.limited
         M = truth.zoom_fixed(found.pan, found.tilt)
-        half = M[:3, :3].T @ [0.117, 0, 0]
+        right, down, _ = truth.hand.rotation.inv().apply([0, 1, 0])  # the pan axis as the zoom camera shows it
+        half = M[:3, :3].T @ (0.117 / np.hypot(right, down) * np.array([down, -right, 0]))
         ends = seen_by_zoom(truth, found, np.stack([x_fixed - half, x_fixed + half]))
         assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(160.0, abs=SIZE_PX)
 

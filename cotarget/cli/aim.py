@@ -154,7 +154,7 @@ def _target(options: argparse.Namespace, config: "RigConfig", calibration: "Cali
     where, wanted_px, size = "--wanted-px", options.wanted_px, calibration.zoom_head.lens.size
     if wanted_px is None and options.focal_mm is None and not options.insist:
         where, wanted_px = f"--wanted-px: missing, and targets.{options.target}.wanted_px", target.wanted_px
-    if wanted_px is not None and wanted_px > size[int(target.is_vertical())]:
+    if wanted_px is not None and wanted_px > calibration.zoom_head.room_px(size, vertical=target.is_vertical()):
         raise ConfigError(f"{where}: {wanted_px:g} px do not fit into the zoom camera's {size[0]}x{size[1]} image")
     return target
 

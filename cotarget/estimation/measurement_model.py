@@ -139,7 +139,7 @@ class Appearance:
         size_px: apparent size of the target's known dimension [px].
         size_sigma: standard deviation of that size, relative.
         focal_px: true focal lengths (fx, fy), (2,) [px].
-        sides: width and height of its box, relative to that size.
+        sides: width and height of its box in the zoom image, relative to that size.
     """
 
     offset_px: Array
@@ -238,25 +238,30 @@ class Estimate:
             pan: reported pan [rad].
             tilt: reported tilt [rad].
             nominal_px: nominal focal length [px].
-            shape: width over height of the target's box.
+            shape: width over height of the target's box in the fixed image.
 
         Returns:
             The appearance; None if the target is behind the zoom camera.
         """
-        tangent, J, d = self.sight_lines.at(pan, tilt, nominal_px).project(self.state)
-        if d[2] <= 0:
+        tangent, J, x_zoom = self.sight_lines.at(pan, tilt, nominal_px).project(self.state)
+        if x_zoom[2] <= 0:
             return None
-        lens = self.calibration.zoom_head.lens.at(nominal_px)
+        head, target = self.calibration.zoom_head, self.target
+        lens = head.lens.at(nominal_px)
         focal = np.array(lens.focal_px)
-        J = focal[:, None] * J
         x, P = self.state, self.state_covariance
-        size = math.exp(x[LOG_SIZE] + x[LOG_APPARENT] - x[LOG_DEPTH]) * self.target.size / d[2]
+        sides = target.sides(shape, head.fixed_roll(float(x[TAN_X]), float(x[TAN_Y])))
+        (a, b), (c, d) = J[:, :2].tolist()
+        scale = math.sqrt(abs(a * d - b * c))
+        turn = ((a / scale, b / scale), (c / scale, d / scale))  # from the fixed to the zoom image
+        J = focal[:, None] * J
+        size = math.exp(x[LOG_SIZE] + x[LOG_APPARENT] - x[LOG_DEPTH]) * target.size / x_zoom[2]
         return Appearance(
             # Distortion is neglected; near the image's centre, where the target should be, it is small.
             offset_px=focal * tangent + np.array(lens.center_px) - lens.image_center_px,
             covariance=J @ P[_SEEN_TWICE] @ J.T,
-            size_px=size * float(focal[int(self.target.is_vertical())]),
+            size_px=size * head.focal_along(focal.tolist(), vertical=target.is_vertical()),
             size_sigma=math.sqrt(max(float(OF_SIZE @ P @ OF_SIZE), 0.0)),
             focal_px=focal,
-            sides=self.target.sides(shape),
+            sides=target.turned(sides, turn),
         )

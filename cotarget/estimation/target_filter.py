@@ -334,14 +334,15 @@ class TargetFilter:
         else:
             part = math.hypot(settings.noise_of_size, 0.5 if detection.clipped else 0.0)
             sigma_u, sigma_v = math.hypot(settings.noise_px, part * width), math.hypot(settings.noise_px, part * height)
-        vertical = self._target.is_vertical(width, height)
-        side = height if vertical else width
+        roll = self._calibration.zoom_head.fixed_roll(*z.tolist())
+        side = length_px = self._target.length(width, height, roll) if width > 0 and height > 0 else 0.0
         if size_px is not None and not detection.clipped:
             side = size_px
         R = (J * np.array([sigma_u**2, sigma_v**2])) @ J.T
         log_depth, sigma = None, math.inf
         if side > 0:
-            log_depth = math.log(self._target.size / (side * abs(J[int(vertical), int(vertical)])))
+            length = self._target.length(width * abs(J[0, 0]), height * abs(J[1, 1]), roll)
+            log_depth = math.log(self._target.size * length_px / (side * length))
             sigma = math.hypot(settings.side_of_size, settings.side_px / side)
         return self._insert(Observation(t, z, R, None, log_depth, sigma, detection.clipped))
 

@@ -87,6 +87,7 @@ class FixedView:
         weight: weight of each pixel of the patch, 0 to 1, (h, w).
         whitening: colour transform that gives the background unit variance in every direction of colour, (3, 3). The
             background's own texture then counts for little.
+        turn: angle from the v axis to the target's own vertical axis [rad].
     """
 
     t: float
@@ -97,6 +98,7 @@ class FixedView:
     corner_px: Array
     weight: Samples
     whitening: Array
+    turn: float
 
     @property
     def side_px(self) -> float:
@@ -124,6 +126,7 @@ def look(
     mask: Image | None,
     target: TargetProfile,
     settings: MatchingSettings = MatchingSettings(),
+    roll: float = 0.0,
 ) -> FixedView | None:
     """Cut the target out of a fixed-camera frame.
 
@@ -133,6 +136,7 @@ def look(
         mask: foreground of the detector, (H, W), or None.
         target: target profile; its matcher decides where the centre of the body is.
         settings: settings of the registration.
+        roll: angle from the v axis to the pan axis, as the image shows it, see `TargetProfile.turn` [rad].
 
     Returns:
         The cut-out; None if the box holds no pixel of the frame.
@@ -160,7 +164,8 @@ def look(
         away = (patch - np.median(background, axis=0)) @ whitening
         foreground = (np.sum(away**2, axis=2) > GATE) & in_box
     is_outline = _is_outline(foreground, in_box, settings)
-    body, sigma = _body(target, center, size, (u, v), foreground if is_outline else None)
+    turn = target.turn(float(size[0]), float(size[1]), roll)
+    body, sigma = _body(target, center, size, (u, v), foreground if is_outline else None, turn)
     if not is_outline:
         foreground = du**2 + dv**2 <= 1
     if detection.clipped:  # the hidden part may be as large again
@@ -169,23 +174,30 @@ def look(
     beyond_u, beyond_v = np.abs(u - center[0]) - size[0] / 2, np.abs(v - center[1])[:, None] - size[1] / 2
     around = np.clip(1 - np.maximum(beyond_u, beyond_v) / margin, 0, 1)  # falls to 0 at the patch's border
     weight = np.where(foreground, 1.0, settings.margin_weight * around).astype(np.float32)
-    return FixedView(frame.t, body, sigma, size, patch, low.astype(float), weight, whitening)
+    return FixedView(frame.t, body, sigma, size, patch, low.astype(float), weight, whitening, turn)
 
 
 def _body(
-    target: TargetProfile, center: Array, size: Array, pixels: tuple[Array, Array], outline: Pixels | None
+    target: TargetProfile, center: Array, size: Array, pixels: tuple[Array, Array], outline: Pixels | None, turn: float
 ) -> tuple[Array, Array]:
     """Locate the centre of the body in a box; return it and its standard deviation, (2,) [px] each.
 
-    `pixels` are u of the patch's columns and v of its rows; `outline`, (h, w), is None where it is not known.
+    `pixels` are u of the patch's columns and v of its rows; `outline`, (h, w), is None where it is not known. `turn` is
+    the angle from the v axis to the vertical axis of an upright target [rad].
     """
     known = target.matcher == "box" or outline is not None
     sigma = np.array(BODY_SIGMA[target.matcher if known else None]) * size
     if target.matcher == "box" or outline is None:
         return center, sigma
     (u, v), (rows, columns) = pixels, outline.nonzero()
-    across = float(np.median(u[columns]))
-    return np.array([across, center[1] if target.matcher == "upright" else np.median(v[rows])], dtype=float), sigma
+    if target.matcher != "upright":
+        return np.array([np.median(u[columns]), np.median(v[rows])], dtype=float), sigma
+    c, s = math.cos(turn), math.sin(turn)
+    across = np.array([c, -s])
+    off = float(np.median(c * (u[columns] - center[0]) - s * (v[rows] - center[1])))
+    squares = np.array([[c * c, s * s], [s * s, c * c]])  # variances turn with the squares
+    own = np.sqrt(squares @ np.square(size)) * BODY_SIGMA["upright"]
+    return center + off * across, np.sqrt(squares @ np.square(own))
 
 
 def _is_outline(foreground: Pixels, in_box: Pixels, settings: MatchingSettings) -> bool:
@@ -364,7 +376,9 @@ class CloseupFinder:
         Returns:
             The cut-out, with the centre of the body; None if the box holds no pixel of the frame.
         """
-        fixed_view = look(frame, detection, mask, self._target, self._settings)
+        head, found = self._calibration.zoom_head, self._calibration.fixed.lens.tangents(detection.center_px)
+        roll = 0.0 if found is None else head.fixed_roll(*found[0].tolist())
+        fixed_view = look(frame, detection, mask, self._target, self._settings, roll)
         if fixed_view is not None:
             self._fixed_views.append(fixed_view)
             kept_s = self._settings.latest_s + self._settings.longest_apart_s

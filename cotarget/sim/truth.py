@@ -42,11 +42,16 @@ class Silhouette:
             same, whatever its size) whose centre a ray from the camera reaches with only the target in the way. So it
             is exact for a target that only the image's border cuts, and has steps of one geom for an occluded target.
             The board and the rig occlude nothing.
+        upright_px: width and height along the target's own axes: across and along its body's upward axis as the image
+            shows that, however the camera is rolled [px], (2,).
+        unhidden: the second of those fractions.
     """
 
     low_px: Array
     high_px: Array
     visible: float
+    upright_px: Array
+    unhidden: float
 
     @property
     def size_px(self) -> Array:
@@ -206,7 +211,9 @@ class Truth:
         if (low < -0.5).any() or (high > np.array(lens.size) - 0.5).any():
             parts = np.split(pixels, self._surfaces[name].starts[1:])
             inside = _fraction_inside(parts, low, high, lens.size)
-        return Silhouette(low, high, inside * self._unhidden(name, data, view[0]))
+        upright_px = _upright(pixels.T, self._up_px(name, data, view, lens))
+        unhidden = self._unhidden(name, data, view[0])
+        return Silhouette(low, high, inside * unhidden, upright_px, unhidden)
 
     def unhidden(self, name: str, camera: CameraName, t: float) -> float:
         """Compute the fraction of a target's geoms that only the target itself occludes at time t [s]."""
@@ -223,12 +230,16 @@ class Truth:
         return (pixels.min(axis=0), pixels.max(axis=0)) if np.isfinite(pixels).all() else None
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
-        """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind."""
+        """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind.
+
+        The box is across and along the vertical as the image shows it, because wings bank.
+        """
         target = self.targets[name]
         phases = np.arange(BEAT_PHASES) / BEAT_PHASES * beat_s if (beat_s := target.kind.beat_s) else [0.0]
         data = self._copy(self.set_bodies(t))
         lens = self.lens(camera, t)
         view = self._camera(data, camera, lens)
+        vertical = _shown((data.xpos[self.model.body(target.body).id] - view[0]) @ view[1], view[1][2], lens)
         joints = [int(self.model.joint(f"{name}/{joint}").qposadr[0]) for joint in target.pose(t).joints]
         sides = []
         for phase in phases:
@@ -236,7 +247,7 @@ class Truth:
                 data.qpos[joints] = list(target.pose(t + phase).joints.values())
                 mujoco.mj_kinematics(self.model, data)
             pixels = self._outline(name, data, view, lens)
-            sides.append(np.max(pixels.max(axis=0) - pixels.min(axis=0)))
+            sides.append(np.max(_upright(pixels.T, vertical)))
         return float(np.max(sides))
 
     def _copy(self, data: "mujoco.MjData") -> "mujoco.MjData":
@@ -269,6 +280,11 @@ class Truth:
         eye, camera_axes = view
         return lens.project((x_world + (data.geom_xpos[surface.geoms] - eye)[surface.owner]) @ camera_axes)
 
+    def _up_px(self, name: str, data: "mujoco.MjData", view: tuple[Array, Array], lens: TrueLens) -> Array:
+        """Give the direction in which a camera shows a target's upward axis, a unit vector, (2,)."""
+        (eye, axes), body = view, self.model.body(self.targets[name].body).id
+        return _shown((data.xpos[body] - eye) @ axes, data.xmat[body].reshape(3, 3)[:, 2] @ axes, lens)
+
     def _camera(self, data: "mujoco.MjData", camera: CameraName, lens: TrueLens) -> tuple[Array, Array]:
         """Give a camera's entrance pupil in the world [m], (3,), and its axes as columns, (3, 3)."""
         body = self._bodies[camera]
@@ -291,6 +307,27 @@ class Truth:
         own = self._surfaces[name].geoms
         hit, _ = _first_hits(self.model, data, eye, data.geom_xpos[own] - eye)
         return float(np.isin(hit, own).mean())
+
+
+def _shown(x_camera: Array, direction: Array, lens: TrueLens) -> Array:
+    """Give the direction in which a short line appears in an image, a unit vector, (2,); distortion is neglected.
+
+    Args:
+        x_camera: where the line is, in the camera's frame, (3,).
+        direction: its direction there, (3,).
+        lens: optics of the camera.
+    """
+    (x, y, z), (a, b, c), (fx, fy) = x_camera.tolist(), direction.tolist(), lens.focal_px
+    u, v = fx * (a * z - x * c), fy * (b * z - y * c)
+    length = math.hypot(u, v)
+    return np.array([u / length, v / length] if length > 0 else [0.0, 1.0])
+
+
+def _upright(pixels: Array, up: Array) -> Array:
+    """Give width and height of pixels (2, ...) across and along a direction (2,), over the last axis, (2, ...)."""
+    u, v = up.tolist()
+    low, high = _ends(np.array([v * pixels[0] - u * pixels[1], u * pixels[0] + v * pixels[1]]))
+    return high - low
 
 
 def _fraction_inside(outlines: list[Array], low: Array, high: Array, size: tuple[int, int]) -> float:
@@ -348,7 +385,8 @@ def sphere_points(count: int) -> Array:
 PHASES = 48  # of a limb cycle; from one to the next the tip of a wing moves by at most 2 % of the span
 EVERY = 6  # every sixth phase is used for the larger side over a cycle
 DIRECTIONS = 160  # in which outermost points are searched, about 16 degrees apart
-Outline = tuple[Array, Array, Array]  # pixels of the centre, the top-left and the bottom-right corner, (2,) each
+# Pixels of the centre, the top-left and the bottom-right corner, and width and height of the upright box, (2,) each.
+Outline = tuple[Array, Array, Array, Array]
 
 
 class TrueView(NamedTuple):
@@ -359,12 +397,14 @@ class TrueView(NamedTuple):
         lens: true optics.
         bent: whether the lens distorts.
         to_image: maps directions in the world to homogeneous pixels, or to camera axes where the lens distorts, (3, 3).
+        axes: the camera's axes in the world, as columns, (3, 3).
     """
 
     eye: Array
     lens: TrueLens
     bent: bool
     to_image: Array
+    axes: Array
 
 
 class Outlines:
@@ -411,33 +451,39 @@ class Outlines:
     def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
         """Bound a target's outline at time t [s]: top-left and bottom-right corner, (2,) [px]; None behind camera."""
         found = self._outline(name, camera, t)
-        return None if found is None else found[1:]
+        return None if found is None else found[1:3]
 
     def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
         """Give a target's outline and visible fraction at time t [s]; None behind the camera.
 
         The fraction inside the image is that of the bounding box, not of the outline.
         """
-        box = self.box(name, camera, t)
-        if box is None:
+        found = self._outline(name, camera, t)
+        if found is None:
             return None
-        low, high = box
+        _, low, high, upright_px = found
+        unhidden = self._truth.unhidden(name, camera, t)
         (left, top), (right, bottom) = low.tolist(), high.tolist()
         width, height = self.lens(camera, t).size
         across = min(right, width - 0.5) - max(left, -0.5)
         down = min(bottom, height - 0.5) - max(top, -0.5)
         if across <= 0 or down <= 0:
-            return Silhouette(low, high, 0.0)
+            return Silhouette(low, high, 0.0, upright_px, unhidden)
         inside = across * down / ((right - left) * (bottom - top))
-        return Silhouette(low, high, inside * self._truth.unhidden(name, camera, t))
+        return Silhouette(low, high, inside * unhidden, upright_px, unhidden)
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
-        """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind."""
+        """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind.
+
+        The box is across and along the vertical as the image shows it, because wings bank.
+        """
         pixels = self._project(name, camera, t, self._beats[name])
         if pixels is None:
             return math.nan
-        low, high = _ends(pixels.reshape(2, PHASES // EVERY, -1))
-        return max((high - low).ravel().tolist())
+        beats = pixels.reshape(2, PHASES // EVERY, -1)
+        view = self.view(camera, t)
+        vertical = _shown(view.axes.T @ (self._pose(name, t)[0] - view.eye), view.axes[2], view.lens)
+        return max(_upright(beats, vertical).ravel().tolist())
 
     def view(self, camera: CameraName, t: float) -> TrueView:
         """Give pose and optics of a camera at time t [s]."""
@@ -458,7 +504,7 @@ class Outlines:
         axes = self._turns[body].copy()
         (fx, fy), (cx, cy), bent = lens.focal_px, lens.center_px, any(lens.distortion)
         to_image = axes.T if bent else np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) @ axes.T
-        return TrueView(self._places[body] + axes[:, 2] * lens.pupil, lens, bent, to_image)
+        return TrueView(self._places[body] + axes[:, 2] * lens.pupil, lens, bent, to_image, axes)
 
     def _at(self, t: float) -> None:
         """Drop the results cached for another time."""
@@ -481,9 +527,17 @@ class Outlines:
         self._at(t)
         if (name, camera) not in self._found:
             pixels = self._project(name, camera, t, self._points[name][self._pose(name, t)[2]])
-            found = None if pixels is None else (pixels[:, -1], *_ends(pixels))
+            found = None
+            if pixels is not None:
+                upright = _upright(pixels, self._up_px(name, camera, t))
+                found = (pixels[:, -1], *_ends(pixels), upright)
             self._found[name, camera] = found
         return self._found[name, camera]
+
+    def _up_px(self, name: str, camera: CameraName, t: float) -> Array:
+        """Give the direction in which a camera shows a target's upward axis, a unit vector, (2,)."""
+        (position, turn, _), view = self._pose(name, t), self.view(camera, t)
+        return _shown(view.axes.T @ (position - view.eye), view.axes.T @ turn[:, 2], view.lens)
 
     def _project(self, name: str, camera: CameraName, t: float, points: Array) -> Array | None:
         """Project points (3, n) of a target's body frame, (2, n) [px]; None where the camera does not image them."""

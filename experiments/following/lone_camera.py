@@ -82,7 +82,7 @@ class Course:
     def size(self) -> float:
         """The dimension with a known size, as a tangent."""
         w, h = self.sides
-        return h if self._target.is_vertical(w, h) else w
+        return self._target.length(w, h)
 
     @property
     def range(self) -> float:

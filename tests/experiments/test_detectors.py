@@ -29,7 +29,9 @@ def watch(found, shift=(0.0, 0.0), camera=STANDS):
     watching = Watch("bird", "motion", camera, config.target("bird"), config, Seer(found))
     for i in range(FRAMES):
         t = i / RATE
-        outlines = {name: Silhouette(at(name, t) - SIDE / 2, at(name, t) + SIDE / 2, 1.0) for name in ("a", "b")}
+        outlines = {
+            name: Silhouette(at(name, t) - SIDE / 2, at(name, t) + SIDE / 2, 1.0, SIDE, 1.0) for name in ("a", "b")
+        }
         watching.see(Frame(np.zeros((480, 640, 3), np.uint8), t), np.array(shift), outlines)
     return watching.row(7)
 

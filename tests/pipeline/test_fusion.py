@@ -427,7 +427,9 @@ def test_a_standing_body_without_its_feet_in_one_frame_stays_where_it_is():
 
     class Exact(Finder):
         def store(self, frame, detection, mask):
-            return type("View", (), {"body_px": detection.center_px, "body_sigma_px": np.array([1.5, 0.7])})
+            return type(
+                "View", (), {"body_px": detection.center_px, "body_sigma_px": np.array([1.5, 0.7]), "turn": 0.0}
+            )
 
     fusion = Pair(PERSON, Exact(), followed=1)
     t = seen(fusion, lambda t: [track(1, usual, t)], 20) + FRAME_S

@@ -1,5 +1,6 @@
 """A target's profile alone decides how it is detected, confirmed, filtered and matched; an own target is no person."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -42,11 +43,30 @@ def test_tracks_of_an_own_detector_are_confirmed_by_their_number(name):
     assert (settings.confirm_travel, settings.confirm_score) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize(("dimension", "box", "vertical", "sides"), [
-    ("height", (3.0, 1.0), True, (3.0, 1.0)), ("width", (1.0, 2.0), False, (1.0, 2.0)),
-    ("wingspan", (4.0, 1.0), False, (1.0, 0.25)), ("wingspan", (1.0, 4.0), True, (0.25, 1.0)),
+@pytest.mark.parametrize(("dimension", "box", "length", "sides"), [
+    ("height", (3.0, 1.0), 1.0, (3.0, 1.0)), ("width", (1.0, 2.0), 1.0, (1.0, 2.0)),
+    ("wingspan", (4.0, 1.0), 4.0, (1.0, 0.25)), ("wingspan", (1.0, 4.0), 4.0, (0.25, 1.0)),
 ])  # fmt: skip
-def test_the_dimension_of_a_box(dimension, box, vertical, sides):
+def test_the_dimension_of_a_box(dimension, box, length, sides):
     profile = replace(CAR, dimension=dimension)
-    assert profile.is_vertical(*box) == vertical
+    assert profile.length(*box) == length
     assert profile.sides(box[0] / box[1]) == pytest.approx(sides)
+
+
+@pytest.mark.parametrize("roll_deg", [0, 30, -30, 45, 90, -90])
+@pytest.mark.parametrize(("dimension", "shape"), [("height", 0.4), ("width", 2.5), ("width", 0.4)])
+def test_a_rolled_camera_sees_the_own_length_of_an_ellipse(dimension, shape, roll_deg):
+    """A target 1 m high and `shape` m wide, whose box the camera sees turned; and one that stands upright in it."""
+    profile = replace(CAR, dimension=dimension, shape=shape)
+    roll = math.radians(roll_deg)
+    box = math.hypot(shape * math.cos(roll), math.sin(roll)), math.hypot(shape * math.sin(roll), math.cos(roll))
+    own = 1.0 if dimension == "height" else shape
+    assert profile.length(*box, roll) == pytest.approx(own)
+    assert profile.turn(*box, roll) == pytest.approx(roll, abs=1e-6)
+    assert profile.length(shape, 1.0, roll) == pytest.approx(own)  # the head is mounted sideways, not the camera
+    assert profile.turn(shape, 1.0, roll) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_without_a_usual_shape_the_nearest_side_is_the_length():
+    profile = replace(CAR, dimension="height")
+    assert [profile.length(3.0, 1.0, math.radians(roll)) for roll in (0, 30, 60, 90)] == [1.0, 1.0, 3.0, 3.0]
