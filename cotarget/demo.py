@@ -182,6 +182,7 @@ SUMMARY = {
     "time_to_acquire_s": ".2f",
     "in_frame_ratio": ".2f",
     "closeup_yield": ".2f",
+    "centred_yield": ".2f",
     "tpo_width_median": ".1%",
     "size_ratio_median": ".2f",
     "range_m": ".1f",
@@ -193,11 +194,13 @@ def summary(metrics: dict[str, Any]) -> str:
     pointing = metrics["calibration"]["pointing_error_deg"]
     lines = [
         f"pointing error of the calibration: median {pointing['median']:.4f}, p95 {pointing['p95']:.4f} degrees",
-        f"{'target':8} {'acquired':>9} {'in frame':>9} {'yield':>6} {'offset':>8} {'size':>6} {'range':>8}",
+        f"{'target':8} {'acquired':>9} {'in frame':>9} {'yield':>6} {'centred':>8}"
+        f" {'offset':>8} {'size':>6} {'range':>8}",
     ]
     for name, scores in metrics["targets"].items():
-        acquired, in_frame, good, offset, size, range_m = (
-            "-" if scores[key] is None else format(scores[key], form) for key, form in SUMMARY.items()
+        acquired, in_frame, good, centred, offset, size, range_m = (
+            "-" if scores.get(key) is None else format(scores[key], form) for key, form in SUMMARY.items()
         )
-        lines.append(f"{name:8} {acquired:>7} s {in_frame:>9} {good:>6} {offset:>8} {size:>6} {range_m:>6} m")
+        shares = f"{in_frame:>9} {good:>6} {centred:>8}"
+        lines.append(f"{name:8} {acquired:>7} s {shares} {offset:>8} {size:>6} {range_m:>6} m")
     return "\n".join(lines)

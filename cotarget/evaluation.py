@@ -239,6 +239,7 @@ def _closeup(truth: Appearances, name: str, target: TargetProfile, t: float, out
         size_px=size,
         wanted_px=longest if longest < target.wanted_px else target.wanted_px,
         visible=0.0 if outline is None else outline.visible,
+        hidden=outline is not None and outline.unhidden < WHOLLY_VISIBLE,
     )
 
 

@@ -21,6 +21,7 @@ from cotarget.files import read_table
 VISIBLE_IN_FRAME = 0.5
 SIZE_IN_FRAME = 0.5
 SERVED_S = 1.0  # total time of good close-ups from which a target counts as served [s]
+CENTRED = 0.05  # largest target point offset of a centred target, over the image's width
 WHOLLY_VISIBLE = 0.999  # least visible part of a wholly visible target; its area is counted on a grid and rounded
 
 
@@ -33,9 +34,11 @@ class Closeup:
         v_px: its v coordinate [px].
         width_px: width of the zoom image [px].
         height_px: height of the zoom image [px].
-        size_px: true size of the wanted dimension in the zoom image [px]; nan behind the camera.
+        size_px: true size of the wanted dimension in the zoom image, along the target's own axis [px]; nan behind the
+            camera.
         wanted_px: wanted size, or the size at the longest focal length if that is less [px].
         visible: part of the true silhouette visible in the zoom image, 0 to 1.
+        hidden: whether something hides a part of the target from the zoom camera.
     """
 
     u_px: float
@@ -45,6 +48,7 @@ class Closeup:
     size_px: float
     wanted_px: float
     visible: float
+    hidden: bool = False
 
     @property
     def inside(self) -> bool:
@@ -65,6 +69,11 @@ class Closeup:
     def good(self) -> bool:
         """Whether the whole target is visible at about the wanted size."""
         return self.inside and self.visible >= WHOLLY_VISIBLE and GOOD_SIZE[0] <= self.size_ratio <= GOOD_SIZE[1]
+
+    @property
+    def centred(self) -> bool:
+        """Whether the close-up is good, with the body centre within 5 % of the width of the image's centre."""
+        return self.good and self.tpo_px <= CENTRED * self.width_px
 
     @property
     def tpo_px(self) -> float:
@@ -88,7 +97,7 @@ class Row:
         t_fixed_s: middle of the fixed frame's exposure [s].
         state: state of the pipeline.
         track: id of the followed track; -1 for none.
-        u_px, v_px, width_px, height_px, size_px, wanted_px, visible: the zoom frame's `Closeup`.
+        u_px, v_px, width_px, height_px, size_px, wanted_px, visible, hidden: the zoom frame's `Closeup`.
         in_wide: whether the target is wholly in the fixed image.
         u_wide_px: true position in the fixed image [px].
         v_wide_px: its v coordinate [px].
@@ -143,11 +152,13 @@ class Row:
     head_commands: int = 0
     lens_commands: int = 0
     on_target: str = ""
+    hidden: bool = False
 
     @property
     def closeup(self) -> Closeup:
         """Ground truth of the zoom frame."""
-        return Closeup(self.u_px, self.v_px, self.width_px, self.height_px, self.size_px, self.wanted_px, self.visible)
+        sizes = self.width_px, self.height_px, self.size_px, self.wanted_px
+        return Closeup(self.u_px, self.v_px, *sizes, self.visible, self.hidden)
 
     @property
     def tpo_deg(self) -> float:
@@ -178,7 +189,8 @@ def read_rows(path: Path) -> list[Row]:
     truth_values = {"True": True, "False": False}
     parse: dict[Any, Callable[[str], Any]] = {int: int, float: float, str: str, bool: truth_values.__getitem__}
     columns = {f.name: parse[f.type] for f in dataclasses.fields(Row)}
-    return [Row(**row) for row in read_table(path, columns, "steps.csv")]
+    later = {"hidden": columns.pop("hidden")}  # version 0.1.0 wrote none
+    return [Row(**row) for row in read_table(path, columns, "steps.csv", optional=later)]
 
 
 # Scores of a run
@@ -204,7 +216,9 @@ class Score:
     Attributes:
         frames: zoom frames since the target was wholly in the fixed image.
         time_to_acquire_s: time from then to the first half second in frame [s].
-        closeup_yield: good close-ups over all those frames, acquisition included.
+        closeup_yield: good close-ups over those of these frames in which nothing hides the target, the time to acquire
+            included.
+        centred_yield: the same, of good close-ups with the target point within 5 % of the width of the image's centre.
         in_frame_ratio: frames in frame over all frames after acquisition, including those in which it was lost.
         tpo_px_median: median target point offset after acquisition [px].
         tpo_width_median: median target point offset after acquisition, over the image's width.
@@ -246,6 +260,7 @@ class Score:
     false_tracks_per_min: float | None = None
     lens_commands_per_min: float | None = None
     id_switches_per_min: float | None = None
+    centred_yield: float | None = None
 
     def summary(self) -> str:
         """The figures that matter most, in one line."""
@@ -253,9 +268,11 @@ class Score:
             return "never wholly in the fixed view"
         if self.time_to_acquire_s is None or self.tpo_width_median is None or self.size_ratio_median is None:
             return f"never acquired in {self.frames} frames"
+        shares = {"yield": self.closeup_yield, "centred": self.centred_yield}
+        yields = "".join(f"{name} {share:.2f}, " for name, share in shares.items() if share is not None)
         return (
-            f"acquired after {self.time_to_acquire_s:.2f} s, yield {self.closeup_yield:.2f}, offset "
-            f"{self.tpo_width_median:.1%} of the width, size ratio {self.size_ratio_median:.2f}"
+            f"acquired after {self.time_to_acquire_s:.2f} s, {yields}offset {self.tpo_width_median:.1%} of the width, "
+            f"size ratio {self.size_ratio_median:.2f}"
         )
 
 
@@ -268,6 +285,7 @@ def score(rows: Sequence[Row]) -> Score:
     counted = rows[start:]
     acquired = _acquired(counted)
     after = counted[acquired:] if acquired is not None else []
+    shown = [row.closeup for row in counted if not row.hidden]
 
     def median(values: Iterable[float]) -> float | None:
         finite = [v for v in values if math.isfinite(v)]
@@ -276,7 +294,7 @@ def score(rows: Sequence[Row]) -> Score:
     return Score(
         frames=len(counted),
         time_to_acquire_s=after[0].t_s - counted[0].t_s if after else None,
-        closeup_yield=float(np.mean([r.closeup.good for r in counted])),
+        closeup_yield=float(np.mean([closeup.good for closeup in shown])) if shown else None,
         in_frame_ratio=float(np.mean([r.closeup.in_frame for r in after])) if after else None,
         tpo_px_median=median(r.closeup.tpo_px for r in after),
         tpo_width_median=median(r.closeup.tpo_px / r.width_px for r in after),
@@ -293,6 +311,7 @@ def score(rows: Sequence[Row]) -> Score:
         false_tracks_per_min=_per_minute(false_tracks((r.t_s, r.off_target.split()) for r in counted), counted),
         lens_commands_per_min=_per_minute(counted[-1].lens_commands - counted[0].lens_commands, counted),
         id_switches_per_min=_per_minute(id_switches(map(_on, counted)), counted),
+        centred_yield=float(np.mean([closeup.centred for closeup in shown])) if shown else None,
     )
 
 

@@ -15,6 +15,7 @@ METRICS = {
     "calibration": {"pointing_error_deg": {"median": 0.0123, "p95": 0.0456}},
     "targets": {
         "book": FIGURES | {"time_to_acquire_s": 0.444, "in_frame_ratio": 1.0, "closeup_yield": 0.876,
+                           "centred_yield": 0.654,
                            "tpo_width_median": 0.01, "size_ratio_median": 1.02, "range_m": 9.96},
         "bird": FIGURES | {"closeup_yield": 0.0, "range_m": 22.0},
     },
@@ -60,9 +61,9 @@ def test_the_summary_has_a_line_a_target_and_a_dash_for_a_missing_figure():
     lines = [line.split() for line in summary(METRICS).splitlines()]
     assert lines[0][-5:] == ["median", "0.0123,", "p95", "0.0456", "degrees"]
     assert lines[1:] == [
-        ["target", "acquired", "in", "frame", "yield", "offset", "size", "range"],
-        ["book", "0.44", "s", "1.00", "0.88", "1.0%", "1.02", "10.0", "m"],
-        ["bird", "-", "s", "-", "0.00", "-", "-", "22.0", "m"],
+        ["target", "acquired", "in", "frame", "yield", "centred", "offset", "size", "range"],
+        ["book", "0.44", "s", "1.00", "0.88", "0.65", "1.0%", "1.02", "10.0", "m"],
+        ["bird", "-", "s", "-", "0.00", "-", "-", "-", "22.0", "m"],
     ]
 
 

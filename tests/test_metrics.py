@@ -32,7 +32,7 @@ def test_a_perfect_run():
     """Two seconds of learning do not count: 50 of 150 rows lie before t = 2 s."""
     found = score(run((150, {})))
     assert found == Score(
-        frames=100, time_to_acquire_s=0.0, closeup_yield=1.0, in_frame_ratio=1.0, tpo_px_median=0.0,
+        frames=100, time_to_acquire_s=0.0, closeup_yield=1.0, centred_yield=1.0, in_frame_ratio=1.0, tpo_px_median=0.0,
         tpo_width_median=0.0, tpo_deg_median=0.0, size_ratio_median=1.0, wanted_px=160.0, range_m=10.0,
         tpe_px_median=0.0, fragmentation_per_min=0.0, identification=1.0, identification_wide=0.0,
         commands_per_min=0.0, reversals_per_min=0.0, false_tracks_per_min=0.0, lens_commands_per_min=0.0,
@@ -117,6 +117,24 @@ def test_in_frame_and_good_closeup(change, in_frame, good):
     assert (row.closeup.in_frame, row.closeup.good) == (in_frame, good)
 
 
+@pytest.mark.parametrize(("change", "centred"), [
+    ({}, True), ({"u_px": CENTRE[0] + 32}, True), ({"u_px": CENTRE[0] + 33}, False),  # 5 % of 640 px
+    ({"u_px": CENTRE[0] - 20, "v_px": CENTRE[1] + 24}, True), ({"v_px": CENTRE[1] - 33}, False),
+    ({"size_px": 1.26 * 160}, False), ({"visible": 0.9}, False),
+])  # fmt: skip
+def test_a_centred_closeup_is_a_good_one_with_the_target_near_the_centre(change, centred):
+    assert dataclasses.replace(GOOD, **change).closeup.centred == centred
+
+
+def test_frames_in_which_something_hides_the_target_do_not_count_in_the_yields_and_those_after_do():
+    """Of 100 frames 20 are hidden. Of the other 80, 60 are good and 40 of these centred."""
+    aside = {"u_px": CENTRE[0] + 40}
+    found = score(run((50, {}), (40, {}), (20, {"visible": 0.0, "hidden": True}), (20, AWAY), (20, aside)))
+    assert (found.frames, found.closeup_yield, found.centred_yield) == (100, 0.75, 0.5)
+    hidden = score(run((60, {"hidden": True, "visible": 0.0})))
+    assert (hidden.closeup_yield, hidden.centred_yield) == (None, None)
+
+
 def test_target_point_offset():
     off = dataclasses.replace(GOOD, u_px=CENTRE[0] + 30, v_px=CENTRE[1] - 40)
     assert off.closeup.tpo_px == pytest.approx(50.0)
@@ -133,7 +151,9 @@ def test_medians():
         (20, {"u_px": CENTRE[0] + 64, "size_px": 176.0, "u_detected_px": math.nan}),
     ]
     found = score(run((50, {}), *thirds))
-    assert found.summary() == "acquired after 0.00 s, yield 1.00, offset 5.0% of the width, size ratio 1.00"
+    assert (
+        found.summary() == "acquired after 0.00 s, yield 1.00, centred 0.67, offset 5.0% of the width, size ratio 1.00"
+    )
     assert found.tpo_px_median == pytest.approx(32.0)
     assert found.tpo_width_median == pytest.approx(0.05)
     assert found.tpo_deg_median == pytest.approx(math.degrees(math.atan(0.032)))

@@ -19,7 +19,7 @@ from experiments.following.wide_view import record
 from experiments.tables import grouped, outside, spread
 
 WAYS = {"with": HeadSettings(), "without": HeadSettings(deadband=False)}
-FIGURES = ("commands_per_min", "reversals_per_min", "tpo_width_median")
+FIGURES = ("commands_per_min", "reversals_per_min", "tpo_width_median", "closeup_yield", "centred_yield")
 # Goals: ratio of the figure with the deadband to that without.
 WANTED = {"commands_per_min": (0.0, 0.5), "reversals_per_min": (0.0, 0.5), "tpo_width_median": (0.0, 1.1)}
 
@@ -52,7 +52,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:
     for name, mine in grouped(rows, "target").items():
         found[name] = {}
         for key in FIGURES:
-            ways = {way: _spread([row[key] for row in each]) for way, each in grouped(mine, "way").items()}
+            ways = {way: _spread([row.get(key) for row in each]) for way, each in grouped(mine, "way").items()}
             found[name][key] = ways | {"over": _over(ways["with"]["median"], ways["without"]["median"])}
     return found
 

@@ -67,6 +67,7 @@ def one(settings: DelaySettings, seed: int) -> list[Row]:
                     "tpo_width": NEVER if found.tpo_width_median is None else found.tpo_width_median,
                     "tpo_deg": found.tpo_deg_median,
                     "closeup_yield": found.closeup_yield,
+                    "centred_yield": found.centred_yield,
                     "in_frame_ratio": found.in_frame_ratio or 0.0,
                 }
             )

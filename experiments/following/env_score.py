@@ -15,12 +15,14 @@ from annotated_types import Gt, Le
 
 from cotarget.control.selection import POLICIES
 from cotarget.env import FOLLOW, SCHEDULE, PipelinePolicy, SchedulingPolicy
+from cotarget.metrics import CENTRED
 from cotarget.sim.targets.random_paths import GROUPED, LONE, SECONDS
 from experiments.engine import Count, Row, Settings
 from experiments.tables import mean_of
 
 CHANCE, PIPELINE = "chance", "pipeline"
 SERVED = ", served"  # suffix of a figure's name: number of targets served, beside the reward
+ALSO_CENTRED = ", centred"  # the same: fraction of the frames with a good close-up whose target is centred
 Policy = Callable[[Any], Any]
 
 
@@ -64,13 +66,18 @@ def chance(env: gymnasium.Env[Any, Any], seed: int) -> Policy:
 
 
 def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> dict[str, float]:
-    """Run an episode; give its reward, its steps, and the targets served where the environment reports them."""
+    """Run an episode; give its reward, its steps, the centred ones of them, and the targets served.
+
+    What the environment does not report is nan.
+    """
     observation, info = env.reset(seed=seed)
-    reward, steps, over = 0.0, 0, False
+    reward, centred, steps, over = 0.0, 0.0, 0, False
+    width: int = env.unwrapped.config.sim.zoom.size[0]  # type: ignore[attr-defined]
     while not over:
         observation, earned, _, over, info = env.step(policy(observation))
         reward, steps = reward + float(earned), steps + 1
-    return {"reward": reward, "steps": steps, "served": info.get("served", np.nan)}
+        centred += float(earned) * (info.get("offset_px", np.nan) <= CENTRED * width)
+    return {"reward": reward, "steps": steps, "centred": centred, "served": info.get("served", np.nan)}
 
 
 def figures_of(rows: Sequence[Row]) -> dict[str, dict[str, list[float]]]:
@@ -78,7 +85,10 @@ def figures_of(rows: Sequence[Row]) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         name, follows = f"{row['env']} {row['of']}", row["env"] == FOLLOW
-        told = {name: row["reward"] / row["steps"]} if follows else {name: row["reward"], name + SERVED: row["served"]}
+        told = {name: row["reward"], name + SERVED: row["served"]}
+        if follows:
+            told = {name: row["reward"] / row["steps"]}
+            told |= {name + ALSO_CENTRED: row["centred"] / row["steps"]} if "centred" in row else {}
         for figure, value in told.items():
             found.setdefault(figure, {}).setdefault(row["policy"], []).append(value)
     return found

@@ -128,6 +128,8 @@ def fire(
                 "t_s": t,
                 "on_target": _on_target(truth, name, shot),
                 "in_frame": seen.in_frame,
+                "good": seen.good,
+                "centred": seen.centred,
                 "tpo_width": seen.tpo_px / seen.width_px,
                 "size_ratio": seen.size_ratio,
                 "found": found,
@@ -278,7 +280,7 @@ def _figures(rows: Sequence[Row]) -> dict[str, float]:
     return {
         "shots": len(shots),
         "not fired": len(rows) - len(shots),
-        "in_frame": _of(np.mean, [row["in_frame"] for row in shots]),
+        **{key: _of(np.mean, [row[key] for row in shots if key in row]) for key in ("in_frame", "good", "centred")},
         "tpo_width": _of(np.median, [row["tpo_width"] for row in shots]),
         "found": _of(np.mean, [row["found"] for row in shots]),
         "corrected_width": _of(np.median, corrected),

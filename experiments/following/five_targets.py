@@ -26,7 +26,7 @@ from cotarget.sim.truth import Truth
 from experiments.engine import Count, Row
 from experiments.following.field import FieldSettings, calibrated, five_targets_config, watched
 from experiments.following.wide_view import WideView, record
-from experiments.tables import grouped
+from experiments.tables import grouped, mean_of
 
 FIRST = "first-come"
 WANTED = 1.5  # goal: targets served by the best policy over those by first-come
@@ -50,7 +50,7 @@ def one(settings: FiveSettings, seed: int) -> list[Row]:
         view = record(config, target, settings.seconds)
         for policy, make in POLICIES.items():
             how = FollowSettings(closed_loop=settings.closed_loop)
-            seconds = good_seconds(calibrated(settings), config, target, settings.seconds, how, view, make())
+            seconds, centred_s = good_seconds(calibrated(settings), config, target, settings.seconds, how, view, make())
             rows.append(
                 {
                     "seed": seed,
@@ -58,6 +58,7 @@ def one(settings: FiveSettings, seed: int) -> list[Row]:
                     "policy": policy,
                     "served": sum(value >= SERVED_S for value in seconds.values()),
                     "good_s": sum(seconds.values()),
+                    "centred_s": centred_s,
                     **{f"good_{i}_s": value for i, value in enumerate(seconds.values(), 1)},
                 }
             )
@@ -72,18 +73,19 @@ def good_seconds(
     how: FollowSettings,
     view: WideView,
     selector: TargetSelector,
-) -> dict[str, float]:
-    """Measure for how long each target of a world was well in the close-up, by ground truth [s]."""
-    good = dict.fromkeys(config.sim.targets, 0.0)
+) -> tuple[dict[str, float], float]:
+    """Measure for how long each target was well in the close-up, and any was centred in it, by ground truth [s]."""
+    good, centred = dict.fromkeys(config.sim.targets, 0.0), 0.0
     last: float | None = None
     for step, truth in watched(calibration, config, target, seconds, how, view, selector):
         t = step.zoom.t
         if last is not None and t > last:  # a frame counts for the time since the one before
             for name in good:
-                if _near(truth, name, t) and closeup_of(truth, name, target, t).good:
+                if _near(truth, name, t) and (closeup := closeup_of(truth, name, target, t)).good:
                     good[name] += t - last
+                    centred += (t - last) * closeup.centred
         last = t
-    return good
+    return good, centred
 
 
 def _near(truth: Truth, name: str, t: float) -> bool:
@@ -97,14 +99,16 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """Give targets served by policy (mean, least and most over the seeds), and the best mean over first-come's."""
     found: dict[str, dict[str, Any]] = {}
     for kind, mine in grouped(rows, "kind").items():
-        served = {policy: _of([row["served"] for row in each]) for policy, each in grouped(mine, "policy").items()}
+        served = {policy: _of(each) for policy, each in grouped(mine, "policy").items()}
         best, first = max(each["mean"] for each in served.values()), served[FIRST]["mean"]
         found[kind] = served | {"best over first": best / first if first else math.inf * best}
     return found
 
 
-def _of(served: Sequence[int]) -> dict[str, float]:
-    return {"mean": float(np.mean(served)), "least": float(min(served)), "most": float(max(served))}
+def _of(rows: Sequence[Row]) -> dict[str, float]:
+    served = [row["served"] for row in rows]
+    seconds = {key: mean_of(row[key] for row in rows if key in row)[0] for key in ("good_s", "centred_s")}
+    return {"mean": float(np.mean(served)), "least": float(min(served)), "most": float(max(served)), **seconds}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:

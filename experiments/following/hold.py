@@ -55,9 +55,16 @@ WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
     },
 }
 # Fractions of the frames for which larger is better; they are 0 for a target that was never acquired.
-SHARES = ("closeup_yield", "in_frame_ratio", "identification")
+SHARES = ("closeup_yield", "centred_yield", "in_frame_ratio", "identification")
 # Figures without goals.
-ALSO = ("tpe_px_median", "false_tracks_per_min", "commands_per_min", "reversals_per_min", "lens_commands_per_min")
+ALSO = (
+    "centred_yield",
+    "tpe_px_median",
+    "false_tracks_per_min",
+    "commands_per_min",
+    "reversals_per_min",
+    "lens_commands_per_min",
+)
 
 
 @dataclass(frozen=True)
@@ -83,7 +90,7 @@ def one(settings: HoldSettings, seed: int) -> list[Row]:
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """Give median, least and largest of each target's figures over the seeds."""
     return {
-        name: {key: _spread(key, [row[key] for row in mine]) for key in (*WANTED[name], *ALSO)}
+        name: {key: _spread(key, [row[key] for row in mine]) for key in (*WANTED[name], *ALSO) if key in mine[0]}
         for name, mine in grouped(rows, "target").items()
     }
 

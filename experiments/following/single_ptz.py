@@ -47,7 +47,7 @@ from experiments.tables import grouped, mean_of
 WIDE_PX = SimConfig().fixed.focal_px[0]
 LEAST_MISS = 0.05
 HELD = 0.85  # least in-frame ratio of both if hardly anything is missed
-FIGURES = ("closeup_yield", "in_frame_ratio", "in_frame_of_all", "tpo_width_median", "watched")
+FIGURES = ("closeup_yield", "centred_yield", "in_frame_ratio", "in_frame_of_all", "tpo_width_median", "watched")
 WAYS = PAIR, LONE_CAMERA = "pair", "lone"
 FAR = 1000.0  # distance at which the offset of the cameras is negligible [m]
 STREAM = 25  # random stream
@@ -90,6 +90,7 @@ def figures(judged: Sequence[Judged], way: str) -> Row:
     since = judged[-found.frames :] if found.frames else []
     return {
         "closeup_yield": found.closeup_yield,
+        "centred_yield": found.centred_yield,
         "in_frame_ratio": found.in_frame_ratio if found.in_frame_ratio is not None else 0.0,
         "in_frame_of_all": float(np.mean([row.closeup.in_frame for row in since])) if since else None,
         "time_to_acquire_s": found.time_to_acquire_s,
@@ -294,7 +295,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
 
 def _told(rows: Sequence[Row], key: str) -> list[float]:
     """Collect a figure's values from the rows that have it."""
-    return [float(row[key]) for row in rows if row[key] is not None]
+    return [float(row[key]) for row in rows if row.get(key) is not None]
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:

@@ -37,6 +37,7 @@ FIGURES = (
     "in_frame_ratio",
     "time_to_acquire_s",
     "closeup_yield",
+    "centred_yield",
     "identification",
     "identification_wide",
     "false_tracks_per_min",
@@ -114,6 +115,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
         way: {
             key: spread(row[key] for row in mine) | {"not measured": float(sum(row[key] is None for row in mine))}
             for key in FIGURES
+            if key in mine[0]
         }
         for way, mine in grouped(rows, "way").items()
     }

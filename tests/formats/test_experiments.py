@@ -20,6 +20,7 @@ from tests.formats.lists import (
     assert_listed,
     command_lines,
     header,
+    leaves,
     listed,
     parser_of,
     read,
@@ -62,7 +63,8 @@ def test_v010_rows_give_the_same_figures(name):
     experiment, result = experiment_of(name), read(OLD / "experiments" / name / "result.json")
     rows = [row for job in old_jobs(name) for row in job["rows"]]
     summary = experiment.summarise(rows)
-    assert_close(plain(summary), result["summary"], FIGURES)
+    found, then = dict(leaves(plain(summary))), dict(leaves(result["summary"]))
+    assert_close({key: found[key] for key in then}, then, FIGURES)  # there may be figures of later versions too
     assert experiment.missed is None or list(experiment.missed(summary)) is not None
     bounds = compare(name, experiment.bounded(summary))
     assert all(bound.reached is not None for bound in bounds), "a figure that has a bound is not there any more"

@@ -172,7 +172,7 @@ def test_a_pupil_looks_past_what_it_has_moved_past(tmp_path):
         with (w := world(effects={"all": False, "optics": True}, zoom=STRAIGHT | {"pupil": pupil}, **sim)).rig as rig:
             rig.zoom.zoom(LONGEST * SHORTEST_PX)
             outline, truth = w.truth().silhouette("book", "zoom", 0.0), w.truth()
-            assert outline.visible == pytest.approx(1.0 if pupil else 0.0)
+            assert outline.visible == outline.unhidden == pytest.approx(1.0 if pupil else 0.0)
             width, height = outline.size_px
             assert truth.largest_side_px("book", "zoom", 0.0) == pytest.approx(max(width, height))
             sides.append(width)
