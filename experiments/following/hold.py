@@ -4,7 +4,8 @@ The rig is the default one, calibrated from rendered boards, under the field's c
 (`experiments.following.field`): exposure blur, clutter, 120 ms from light to frame, 80 ms from command to
 motion, and true sizes that differ from the nominal ones. Each seed has another path, size and noise. Figures are
 medians over the seeds with the least and the largest, as defined in `cotarget.metrics`. Ground truth judges every
-frame; the pipeline has no access to it.
+frame; the pipeline has no access to it. Simple controllers and an oracle run on the same courses
+(`experiments.following.controllers`).
 """
 
 import dataclasses
@@ -16,9 +17,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cotarget.metrics import score
 from experiments.engine import Count, Row
-from experiments.following.field import FieldSettings, calibrated, held, hold_config
+from experiments.following.controllers import ORACLE, OURS, WAYS, comparison, scores
+from experiments.following.field import FieldSettings, hold_config
 from experiments.tables import grouped, outside, spread
 
 # Goals for each figure's median: least and largest value.
@@ -73,26 +74,32 @@ class HoldSettings(FieldSettings):
 
     seeds: Count = 2
     targets: tuple[str, ...] = tuple(WANTED)  # book, person or bird
+    ways: tuple[str, ...] = WAYS  # controllers; this project's is among them
 
 
 def one(settings: HoldSettings, seed: int) -> list[Row]:
-    """Follow each target once; give a row per target."""
+    """Follow each target once in each way; give a row per run."""
     return [
-        {
-            "seed": seed,
-            "target": name,
-            **dataclasses.asdict(score(held(calibrated(settings), hold_config(name, seed), name, settings.seconds))),
-        }
+        {"seed": seed, "target": name, "way": way, **dataclasses.asdict(found)}
         for name in settings.targets
+        for way, found in scores(settings, hold_config(name, seed), name, settings.ways)
     ]
 
 
-def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Give median, least and largest of each target's figures over the seeds."""
-    return {
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Give median, least and largest of each target's figures over the seeds, then the yields of all controllers."""
+    found: dict[str, dict[str, Any]] = {
         name: {key: _spread(key, [row[key] for row in mine]) for key in (*WANTED[name], *ALSO) if key in mine[0]}
-        for name, mine in grouped(rows, "target").items()
+        for name, mine in grouped(_ours(rows), "target").items()
     }
+    if len({row.get("way") for row in rows}) > 1:
+        found |= {f"{name}, by controller": comparison(mine) for name, mine in grouped(rows, "target").items()}
+    return found
+
+
+def _ours(rows: Sequence[Row]) -> list[Row]:
+    """Select the project's own rows; there were no others before version 0.2."""
+    return [row for row in rows if row.get("way", OURS) == OURS]
 
 
 def _spread(key: str, values: Sequence[float | None]) -> dict[str, float]:
@@ -104,12 +111,12 @@ def _spread(key: str, values: Sequence[float | None]) -> dict[str, float]:
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """List the figures that miss their goal."""
-    return [text for name, figures in summary.items() for text in outside(figures, WANTED[name], name)]
+    return [text for name in WANTED if name in summary for text in outside(summary[name], WANTED[name], name)]
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Close-up yield and offset by target: medians with bars from the least seed to the largest, a point a seed."""
-    targets = grouped(rows, "target")
+    targets = grouped(_ours(rows), "target")
     labels = {"closeup_yield": "close-up yield", "tpo_width_median": "median offset / width"}
     for ax, (key, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
         for i, mine in enumerate(targets.values()):
@@ -123,5 +130,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = HoldSettings()
-QUICK = dataclasses.replace(SETTINGS, seconds=5.0, calibrated=False)
-COST_S = 150.0
+QUICK = dataclasses.replace(SETTINGS, seconds=5.0, calibrated=False, ways=(OURS, ORACLE))
+COST_S = 250.0
