@@ -298,3 +298,43 @@ BOOK, PERSON, BIRD = (DEFAULT_TARGETS[name] for name in ("book", "person", "bird
 def test_target_that_is_none_or_that_no_lens_shows_is_implausible(target, name, rig, key):
     found = target_implausibility(target, HOME, rig, name)
     assert found.startswith(f"{key}: ") if key else not found
+
+
+def rolled_home(fixed_deg, zoom_deg):
+    """The plain rig with cameras rolled clockwise, on a head that stays upright."""
+    fixed, zoom = (
+        RigidTransform.from_rotation(Rotation.from_euler("z", deg, degrees=True)) for deg in (fixed_deg, zoom_deg)
+    )
+    head = HOME.zoom_head
+    return with_zoom_head(
+        HOME, T_zoom0_fixed=zoom.inv() * head.T_zoom0_fixed * fixed, T_head_zoom=head.T_head_zoom * zoom
+    )
+
+
+@pytest.mark.parametrize(("roll_deg", "shown_deg"), [(0, 0), (30, 30), (90, 90), (-90, 90), (135, -45), (180, 0)])
+def test_a_cameras_roll_is_that_of_the_pan_axis_in_its_image(roll_deg, shown_deg):
+    """A line has no direction, so that 135 degrees look as -45."""
+    fixed, zoom = rolled_home(roll_deg, 0).zoom_head, rolled_home(0, roll_deg).zoom_head
+    assert abs(math.remainder(fixed.fixed_roll(0.0, 0.0) - math.radians(shown_deg), math.pi)) < RELATIVE
+    assert abs(math.remainder(zoom.zoom_roll - math.radians(shown_deg), math.pi)) < RELATIVE
+    assert (zoom.fixed_roll(0.0, 0.0), fixed.zoom_roll) == pytest.approx((0.0, 0.0), abs=RELATIVE)  # the other camera's
+
+
+def test_a_height_has_the_rows_for_room_in_a_zoom_camera_on_its_side():
+    sideways = rolled_home(0, 90)
+    for target, wanted_px, fits in ((PERSON, 600.0, True), (BOOK, 600.0, False), (BOOK, 470.0, True)):
+        found = target_implausibility(replace(target, wanted_px=wanted_px), sideways, spec(), "it")
+        assert bool(found) != fits
+
+
+@pytest.mark.parametrize("zoom_deg", [0, 30, 90, 180, -90])
+def test_the_closeup_is_as_large_as_wanted_at_any_roll_of_a_camera_with_oblong_pixels(zoom_deg):
+    """A person's two ends, one above the other before the rig, are 300 px apart by a lens with fy = 1.2 fx."""
+    rig = rolled_home(0, zoom_deg)
+    oblong = Intrinsics(SIZE, (700.0, 840.0), (319.5, 239.5))
+    rig = with_zoom_head(rig, lens=ZoomLens((700.0, 7000.0), (oblong, replace(oblong, focal_px=(7000.0, 8400.0)))))
+    x_fixed = np.array([0.0, 0.0, 20.0])
+    found = aim(rig, x_fixed, wanted_size=WantedSize(1.75, 300.0, vertical=True))
+    ends = x_fixed + np.array([[0, -0.875, 0], [0, 0.875, 0]])
+    shown = rig.zoom_head.project(ends, found.pan, found.tilt, found.nominal_px)
+    assert np.linalg.norm(shown[1] - shown[0]) == pytest.approx(300.0, rel=0.01)  # the range is along the ray

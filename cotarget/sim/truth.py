@@ -385,7 +385,7 @@ def sphere_points(count: int) -> Array:
 PHASES = 48  # of a limb cycle; from one to the next the tip of a wing moves by at most 2 % of the span
 EVERY = 6  # every sixth phase is used for the larger side over a cycle
 DIRECTIONS = 160  # in which outermost points are searched, about 16 degrees apart
-# Pixels of the centre, the top-left and the bottom-right corner, and width and height of the upright box, (2,) each.
+# Pixels of the centre, the top-left and the bottom-right corner, (2,) each, and of the outermost points, (2, n).
 Outline = tuple[Array, Array, Array, Array]
 
 
@@ -461,7 +461,8 @@ class Outlines:
         found = self._outline(name, camera, t)
         if found is None:
             return None
-        _, low, high, upright_px = found
+        _, low, high, pixels = found
+        upright_px = _upright(pixels, self._up_px(name, camera, t))
         unhidden = self._truth.unhidden(name, camera, t)
         (left, top), (right, bottom) = low.tolist(), high.tolist()
         width, height = self.lens(camera, t).size
@@ -527,10 +528,7 @@ class Outlines:
         self._at(t)
         if (name, camera) not in self._found:
             pixels = self._project(name, camera, t, self._points[name][self._pose(name, t)[2]])
-            found = None
-            if pixels is not None:
-                upright = _upright(pixels, self._up_px(name, camera, t))
-                found = (pixels[:, -1], *_ends(pixels), upright)
+            found = None if pixels is None else (pixels[:, -1], *_ends(pixels), pixels)
             self._found[name, camera] = found
         return self._found[name, camera]
 
