@@ -31,6 +31,7 @@ HIDDEN_S, MOST_TOUCHED_S = 2.0, 2.8  # time behind the wall, and longest with th
 LEAST_HIDDEN_S = 1.2  # shortest time wholly behind it [s]
 WALL_AT = 0.85  # distance of the wall, in parts of the target's least distance behind it
 WALL_THICKNESS = 0.2  # [m]
+REACH = 0.28  # farthest aside, in parts of the least depth; farther out saplings hide a person
 TRIES, PLACES = 3000, 8  # limit on the courses drawn, and on the places of a wall for each
 
 
@@ -122,7 +123,7 @@ def _drawn(rng: np.random.Generator, style: Style, t: Array, enters: bool) -> Ar
     """Draw positions at times (n,), (n, 3) [m]; one that enters comes into view from the side after a second."""
     approach = np.clip((t - 1.0) / (t[-1] - AFTER - 1.0), 0.0, 1.0)
     depth = style.depths[0] + (style.depths[1] - style.depths[0]) * approach
-    reach = 0.36 * depth.min()  # where it turns round [m]
+    reach = REACH * depth.min()  # where it turns round [m]
     begin = rng.choice([-1.0, 1.0]) * 0.56 * style.depths[0] if enters else rng.uniform(-0.5, 0.5) * reach
     across, at = np.empty_like(t), float(begin)
     for speed, now in zip(_speeds(rng, style, t), range(len(t)), strict=True):
@@ -174,8 +175,8 @@ def _can_be_followed(x: Array) -> bool:
 
 
 def _wall(rng: np.random.Generator, style: Style, t: Array, x: Array) -> Wall | None:
-    """Place a wall that hides a target for two seconds in the middle of its course; None if it would not do that."""
-    begin = rng.uniform(0.3, 0.7) * (t[-1] - t[0]) + t[0]
+    """Place a wall that hides a target for two seconds in the first half of its course; None if it would not."""
+    begin = rng.uniform(0.2, 0.5) * (t[-1] - t[0]) + t[0]
     behind = (t >= begin) & (t <= begin + HIDDEN_S)
     (pan, tilt), distance = _angles(x), np.hypot(*(x - MOUNT)[:, :2].T)
     least = float(distance[behind].min())
