@@ -357,10 +357,10 @@ def _on(row: Row) -> list[tuple[str, str]]:
 
 
 def false_tracks(off: Iterable[tuple[float, Collection[Hashable]]]) -> int:
-    """Count tracks that were confirmed and off every target for half a second without a break.
+    """Count tracks that were reported and off every target for half a second without a break.
 
     Args:
-        off: time of each frame [s], and the confirmed tracks that are off every target in it.
+        off: time of each frame [s], and the reported tracks that are off every target in it.
     """
     false: set[Hashable] = set()
     since: dict[Hashable, float] = {}

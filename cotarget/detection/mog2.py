@@ -12,8 +12,7 @@ import numpy as np
 from cotarget.detection.base import Detections, SizeCheck, Tracks, box_detection, flood, pieces
 from cotarget.rig import Frame
 
-# Memory of OpenCV's default mixture, 120 frames at 30 a second, and time from the first frame to the first that is
-# searched: the 13th at 25 a second, the 16th at 30 [s].
+# Memory of OpenCV's default mixture, 120 frames at 30 a second, and time that is learnt before a detection [s].
 HISTORY_S, WARM_UP_S = 4.0, 0.5
 # Squared distance to the background, in variances, from which a pixel is foreground.
 THRESHOLD = 25.0
