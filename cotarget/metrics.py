@@ -105,7 +105,7 @@ class Row:
         v_detected_px: its v coordinate [px].
         decoded: whether the target's marker decodes in the zoom image.
         decoded_wide: whether the target's marker decodes in the fixed image.
-        off_target: ids of the confirmed tracks that are off every target, as "3 7".
+        off_target: ids of the reported tracks that are off every target, as "3 7".
         range_m: true distance from the zoom camera [m].
         depth_m: estimated depth [m]; nan if nothing was aimed at.
         pan_commanded_deg: last commanded pan [degrees].
