@@ -640,11 +640,18 @@ class FollowConfig:
         calibration: the rig's calibration, relative to rig.toml; calibration.json beside rig.toml by default.
         ignored: regions of the fixed camera's image in which nothing is detected, such as a clock, a flag or a road:
             polygons of three or more points, in parts of the image from 0 to 1, u to the right and v down.
+        when_idle: what a head that is steered from a page does after nothing was followed for `idle_s`: wait for the
+            next target where it is; stand until it is told to follow; or go home once, and stand there.
+        idle_s: that time [s].
+        unattended: whether a head goes on following when the last page closes, or stands.
     """
 
     target: str | None = None
     calibration: FilePath | None = None
     ignored: tuple[Polygon, ...] = ()
+    when_idle: Literal["wait", "stand", "home"] = "wait"
+    idle_s: Positive = 30.0
+    unattended: Literal["follow", "stand"] = "follow"
 
 
 @model

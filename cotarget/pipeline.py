@@ -7,7 +7,7 @@ may fail for a moment, because its lens moves, its line is slow or it reconnects
 
 import enum
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Real
 
@@ -20,11 +20,20 @@ from cotarget.calibration.plausibility import check_plausible
 from cotarget.config import Polygon, TargetProfile
 from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
-from cotarget.control.selection import FirstCome, TargetSelector, candidates_of
+from cotarget.control.orders import HOME, MANUAL_S, Order
+from cotarget.control.selection import Chosen, FirstCome, TargetSelector, candidates_of
 from cotarget.control.zoom import ZoomSettings, is_seen_well
 from cotarget.detection import Detections, Detector, make_detector
 from cotarget.detection.base import flood
-from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices, naming
+from cotarget.errors import (
+    ConfigError,
+    DeviceError,
+    EmergencyStopError,
+    StaleFrameError,
+    UnreachableError,
+    choices,
+    naming,
+)
 from cotarget.estimation import Estimate, FilterSettings, filter_settings
 from cotarget.estimation.zoom_matching import MatchingSettings, ZoomMeasurement
 from cotarget.fusion import FusionSettings, MakeFinder, TargetFusion, ZoomSearch
@@ -59,6 +68,9 @@ GONE_S = 10.0
 MID_GREY = (128, 128, 128)
 # Longest interval that counts as the period of commands [s]; a longer one was a gap between frames.
 LONGEST_INTERVAL_S = 0.2
+HEAD = "head"  # name of the only head
+MOVED = math.radians(0.2)  # least angle by which a standing head was moved by something else [rad]
+Orders = Callable[[], Sequence[Order]]  # gives the orders of an operator that have come since the frame before
 
 
 class FrameSource:
@@ -232,6 +244,20 @@ class State(enum.StrEnum):
     COASTING = "coasting"  # the target is out of sight for a moment; the head follows its prediction
     LOST = "lost"  # out of sight for longer: the lens zooms out; the head goes on while the prediction is certain
     UNREACHABLE = "unreachable"  # the target is seen but cannot be aimed at
+    STANDING = "standing"  # an operator lets head and lens stand; detection and tracks go on
+    MANUAL = "manual"  # an operator moves the head or the lens by hand
+    MOVED = "moved by others"  # the head should stand, and something else moves it
+
+
+OPERATED = (State.STANDING, State.MANUAL, State.MOVED)  # states that only a run with an operator has
+
+
+class Mode(enum.StrEnum):
+    """What one head does: each is an operator's choice; a run without an operator follows."""
+
+    FOLLOWING = "following"
+    STANDING = "standing"
+    MANUAL = "manual"
 
 
 @dataclass(frozen=True)
@@ -431,6 +457,8 @@ class HeadRun:
         lens: newest state of the lens.
         controller: commands head and lens.
         search: search for the followed target in the zoom image.
+        selector: selects the track to follow.
+        mode: what the head does.
     """
 
     def __init__(
@@ -442,7 +470,10 @@ class HeadRun:
         settings: FollowSettings,
     ) -> None:
         """Start without a target."""
-        self._rig, self._selector, self._settings = rig, selector, settings
+        self._rig, self._settings = rig, settings
+        self.selector, self.policy, self.mode = selector, selector, Mode.FOLLOWING
+        self._why, self._goes_home = "", False
+        self._rest: tuple[float, float] | None = None  # pan and tilt at which the head stands [rad]
         self._T_base_fixed = calibration.zoom_head.T_base_fixed
         self.search = ZoomSearch(
             calibration,
@@ -470,7 +501,7 @@ class HeadRun:
                 target.unreachable = estimate is not None and not self.controller.can_reach(estimate)
         head = np.array([self.head.pan, self.head.tilt])
         candidates = candidates_of(targets, now, self._T_base_fixed, self._rig.fixed.size)
-        number = self._selector.select(candidates, head, self._rig.head.limits)
+        number = self.selector.select(candidates, head, self._rig.head.limits)
         found = next((target for target in targets if target.id == number), None)
         self.search.search_for(found)
         return found
@@ -478,7 +509,7 @@ class HeadRun:
     def wait(self, found: Detections, tracks: Sequence[Track]) -> Outcome:
         """Zoom out while no target is followed, and explain why none is."""
         self.controller.zoom_out()
-        if unmet := self._selector.unmet:
+        if unmet := self.selector.unmet:
             return State.SEARCHING, (unmet,), None
         if tracks:
             return State.SEARCHING, ("what is detected is not confirmed yet",), None
@@ -509,6 +540,60 @@ class HeadRun:
             return State.COASTING, reasons, aim
         state = State.UNCONFIRMED if self.search.is_unconfirmed else State.FOLLOWING
         return state, reasons, aim
+
+    def obey(self, order: Order) -> None:
+        """Carry out an operator's order to this head.
+
+        Raises:
+            EmergencyStopError: the head is stopped, so it does not move.
+        """
+        self._why, self._goes_home = "", self._goes_home and order.kind == "zoom"
+        match order.kind:
+            case "follow":
+                self._choose(order)
+                self.mode = Mode.FOLLOWING
+            case "stand":
+                self.stand()
+            case "manual":
+                self.mode = Mode.MANUAL
+                self.controller.turn(order.rates, MANUAL_S)
+            case "zoom":
+                if self.mode is not Mode.FOLLOWING:
+                    self.controller.zoom_by(order.factor)
+            case "home":
+                self.mode, self._goes_home, self._why = Mode.MANUAL, True, "goes home"
+                self.controller.go_to(*self._rig.head.limits.clip(*HOME))
+
+    def _choose(self, order: Order) -> None:
+        """Select what an order names; without a name, by the run's own policy."""
+        if order.track is None and order.click is None:
+            self.selector = self.policy
+        else:
+            self.selector = Chosen(number=order.track, pixel=order.click)
+        self.selector.start(self._rig.fixed.size)
+
+    def stand(self, why: str = "") -> None:
+        """Halt the head, and let head and lens stand from now on."""
+        self.mode, self._why, self._goes_home, self._rest = Mode.STANDING, why, False, None
+        self.controller.stand()
+
+    def rest(self) -> Outcome:
+        """Leave a head alone that stands or is moved by hand; follow no target."""
+        self.search.search_for(None)
+        at = (self.head.pan, self.head.tilt)
+        if self._goes_home and not self.head.moving and self._is_at(at, self.controller.commanded[:2]):
+            self.mode, self._why, self._goes_home, self._rest = Mode.STANDING, "is at home", False, at
+        if self.mode is Mode.MANUAL:
+            return State.MANUAL, (self._why,), None
+        moved = self._rest is not None and not self._is_at(at, self._rest)
+        if not self.head.moving:
+            self._rest = at
+        return State.MOVED if moved else State.STANDING, (self._why,), None
+
+    def _is_at(self, a: Sequence[float], b: Sequence[float]) -> bool:
+        """Whether both axes are at the same angles, but for their tolerance."""
+        axes = self._rig.head.limits.axes
+        return all(abs(x - y) <= axis.tolerance + MOVED for x, y, axis in zip(a, b, axes, strict=True))
 
     def count_seen_well(self, target: Target, seconds: float) -> None:
         """Count a time [s] if the close-up shows a target well, by the states at the newest fixed frame's time."""
@@ -558,7 +643,8 @@ class Run:
         calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
         selector, settings = selector or FirstCome(), settings or FollowSettings()
         settings = replace(settings, filter=settings.filter or filter_settings(target, calibration))
-        self._rig, self._selector = rig, selector
+        self._rig = rig
+        self._orders: Orders | None = None
         self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
         tracker = Tracker(settings.tracking or tracking_settings(target), rig.fixed.size)
         self.camera = CameraRun(detector, tracker, () if rig.config is None else rig.config.follow.ignored)
@@ -566,8 +652,14 @@ class Run:
         self.head = HeadRun(rig, calibration, target, selector, settings)
         self._index = 0
 
-    def follow(self, seconds: float = math.inf) -> Iterator[Step]:
-        """Yield one Step for each frame of the fixed camera, for a time on the rig's clock [s]."""
+    def follow(self, seconds: float = math.inf, orders: Orders | None = None) -> Iterator[Step]:
+        """Yield one Step for each frame of the fixed camera.
+
+        Args:
+            seconds: duration on the rig's clock [s].
+            orders: gives an operator's orders. With them an emergency stop lets the heads stand and the run goes on.
+        """
+        self._orders = orders
         end = self._rig.clock.now() + seconds
         while self._rig.clock.now() < end:
             yield self.step()
@@ -577,16 +669,12 @@ class Run:
         frames, head = self._frames, self.head
         frame = frames.read_fixed()
         detections, tracks = self.camera.track(frame), self.camera.tracks
-        favoured = {track.id for track in tracks if self._selector.favours(track)}
+        favoured = {track.id for track in tracks if head.selector.favours(track)}
         self.fusion.add_tracks(frame, tracks, detections.mask, [head.search], favoured)
         head.read_states()
         zoom = frames.read_zoom()
         found = head.search.add_frame(zoom if frames.zoom_is_new else None, frame.t)
-        target = head.select(self.fusion.targets.values())
-        if target is None:
-            state, reasons, aim = head.wait(detections, tracks)
-        else:
-            state, reasons, aim = head.aim_at(target, frame.t, min(frames.interval, LONGEST_INTERVAL_S))
+        target, (state, reasons, aim) = self._act(frame, detections)
         head.read_states()
         estimate = None if target is None else target.estimate(frame.t)
         self._index += 1
@@ -612,6 +700,36 @@ class Run:
             skipped=self._skipped(),
             ignored=self.camera.ignored,
         )
+
+    def _act(self, frame: Frame, detections: Detections) -> tuple[Target | None, Outcome]:
+        """Obey the orders, then follow, stand or move by hand; return the followed target too."""
+        head = self.head
+        try:
+            for order in () if self._orders is None else self._orders():
+                self._obey(order)
+            if head.mode is not Mode.FOLLOWING:
+                return None, head.rest()
+            target = head.select(self.fusion.targets.values())
+            if target is None:
+                return None, head.wait(detections, self.camera.tracks)
+            return target, head.aim_at(target, frame.t, min(self._frames.interval, LONGEST_INTERVAL_S))
+        except EmergencyStopError as error:
+            if self._orders is None:
+                raise
+            head.stand(str(error))
+            return None, head.rest()
+
+    def _obey(self, order: Order) -> None:
+        """Carry out an order to the rig or to a head."""
+        if order.kind == "stop":
+            if self._rig.stopped is None:
+                self._rig.stop(order.reason)
+            self.head.stand(order.reason)
+        elif order.kind == "clear":
+            self.head.stand("the stop was cleared")
+            self._rig.clear()
+        elif order.of in ("", HEAD):
+            self.head.obey(order)
 
     def _skipped(self) -> int:
         """Number of frames of the fixed camera between the last two that were worked on."""

@@ -24,7 +24,7 @@ from cotarget.parallel import progress_bar
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig, TargetProfile
-    from cotarget.pipeline import Step
+    from cotarget.pipeline import Run, Step
     from cotarget.recording.replay import Replay
     from cotarget.rig import Rig
 
@@ -57,6 +57,7 @@ class RunInputs:
         seconds: duration [s]; infinite until Ctrl-C, or until a recording ends.
         expected: number of steps; None if it is unknown.
         replay: the recording that is replayed; None for a rig.
+        operated: yields the steps of a run that an operator gives orders; None for a run without one.
     """
 
     open_rig: "Callable[[], Rig]"
@@ -68,6 +69,7 @@ class RunInputs:
     seconds: float
     expected: int | None
     replay: "Replay | None" = None
+    operated: "Callable[[Rig, Run], Iterator[Step]] | None" = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +132,8 @@ def run_observed(run: RunInputs, options: argparse.Namespace, *more: Observer) -
 
             def steps() -> "Iterator[Step]":  # a recording may end before the first step
                 selector = run.selection.selector
-                yield from Run(rig, run.calibration, target, detector, selector=selector).follow(run.seconds)
+                made = Run(rig, run.calibration, target, detector, selector=selector)
+                yield from made.follow(run.seconds) if run.operated is None else run.operated(rig, made)
 
             try:
                 for step in until_end(steps(), run.replay):
@@ -204,16 +207,16 @@ class StepCounts:
     """Counts of a run's steps.
 
     Attributes:
-        states: number of steps in each state.
+        states: number of steps in each state; the states of a run with an operator are there once they come.
         skipped: number of the fixed camera's frames that the run did not work on.
         confirmed: number of steps in which the zoom camera showed the followed target.
         first_t: time of the first step's frame [s]; nan before it.
     """
 
     def __init__(self) -> None:
-        from cotarget.pipeline import State
+        from cotarget.pipeline import OPERATED, State
 
-        self.states: dict[str, int] = dict.fromkeys(State, 0)
+        self.states: dict[str, int] = {state: 0 for state in State if state not in OPERATED}
         self.skipped = self.confirmed = 0
         self.first_t = math.nan
 
@@ -223,7 +226,7 @@ class StepCounts:
 
         if not self.steps:
             self.first_t = step.fixed.t
-        self.states[step.state] += 1
+        self.states[step.state] = self.states.get(step.state, 0) + 1
         self.skipped += step.skipped
         self.confirmed += step.found is not None and step.state is not State.UNCONFIRMED
 

@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from cotarget.cli.common import add_file, check_outputs, print_json, rig_files, scores_of
@@ -19,7 +19,7 @@ from cotarget.cli.pipeline_run import (
 )
 
 if TYPE_CHECKING:
-    from cotarget.pipeline import Step
+    from cotarget.pipeline import Run, Step
     from cotarget.rig import Rig
     from cotarget.track_metrics import Tracked
 
@@ -56,7 +56,12 @@ def run(options: argparse.Namespace) -> int:
     def opened() -> "Rig":
         return guard(played.rig, config.safety)
 
+    def operated(rig: "Rig", run: "Run") -> "Iterator[Step]":
+        return run.follow(orders=played.orders)
+
     run = RunInputs(opened, config, calibration, name, rate_hz, selection, math.inf, recording.steps, played)
+    if recording.orders:
+        run = dataclasses.replace(run, operated=operated)
     result = run_observed(run, options, seen)
     if result.interrupt is not None:
         raise result.interrupt

@@ -15,7 +15,7 @@ from cotarget.control.head import HeadController, HeadSettings
 from cotarget.control.zoom import ZoomController, ZoomSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
-from cotarget.rig import PanTiltState, Rig
+from cotarget.rig import Angles, PanTiltState, Rig, Speed
 from cotarget.targeting import Aim, Reach, aim
 
 NO_CHANGE = 1e-6  # least change of the logarithm of the focal length that is commanded
@@ -172,6 +172,46 @@ class Controller:
         if focal > shortest:
             self.commanded = (pan, tilt, self._rig.zoom.zoom(shortest))
             self.lens_commands += 1
+
+    def stand(self) -> None:
+        """Halt the head where it is; the lens stays as it is."""
+        self._rig.head.halt()
+        state = self._rig.head.state()
+        self.commanded = (state.pan, state.tilt, self.commanded[2])
+
+    def turn(self, rates: Angles, seconds: float) -> None:
+        """Turn the head by hand for a time [s].
+
+        Args:
+            rates: rates of pan and tilt, in parts of the field of view a second.
+            seconds: for how long, unless another command comes.
+        """
+        self._head_controller.head.add_report(self._rig.head.state())
+        lens = self._rig.zoom.state().focal_px
+        field = self._rig.zoom.size[0] / self._true(lens)
+        effect_t = self._rig.clock.now() + self._rig.spec.head.delay_s
+        command = self._head_controller.turn(effect_t, (rates[0] * field, rates[1] * field), seconds)
+        self._move(command.pan, command.tilt, command.speed)
+
+    def go_to(self, pan: float, tilt: float) -> None:
+        """Send the head to angles [rad], and the lens to its shortest focal length."""
+        self.zoom_out()
+        self._move(pan, tilt, None)
+
+    def zoom_by(self, factor: float) -> None:
+        """Multiply the commanded focal length, within the lens's range."""
+        pan, tilt, focal = self.commanded
+        shortest, longest = self._rig.zoom.focal_range
+        wanted = min(max(focal * factor, shortest), longest)
+        if abs(math.log(wanted / focal)) > NO_CHANGE:
+            self.commanded = (pan, tilt, self._rig.zoom.zoom(wanted))
+            self.lens_commands += 1
+
+    def _move(self, pan: float, tilt: float, speed: Speed | None) -> None:
+        """Command the head, and remember what was commanded."""
+        pan, tilt = self._rig.head.move(pan, tilt, speed)
+        self.head_commands += 1
+        self.commanded = (pan, tilt, self.commanded[2])
 
     def can_reach(self, estimate: Estimate) -> bool:
         """Whether the head can point at an estimated target."""

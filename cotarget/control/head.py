@@ -297,6 +297,23 @@ class HeadController:
         self.head.add_command(effect_t, command)
         return command
 
+    def turn(self, effect_t: float, rates: Angles, ahead_s: float) -> HeadCommand:
+        """Turn each axis at a given rate for a time, then let it brake; an axis without a rate brakes now.
+
+        Args:
+            effect_t: time at which a command given now takes effect [s].
+            rates: rates of pan and tilt [rad/s].
+            ahead_s: for how long the axes turn [s].
+        """
+        goals, speeds = [], []
+        for (x, v), rate, axis in zip(self.head.motion_at(effect_t), rates, self._limits.axes, strict=True):
+            turns = math.copysign(min(abs(rate), axis.speed), rate) if rate else v
+            goals.append(x + (turns * ahead_s if rate else 0.0) + turns * abs(turns) / (2 * axis.assumed_acceleration))
+            speeds.append(max(abs(turns), LEAST_SPEED))
+        command = self._clipped(HeadCommand(goals[0], goals[1], (speeds[0], speeds[1])))
+        self.head.add_command(effect_t, command)
+        return command
+
     def _damped(self, wanted: Angles, rates: Angles, zone: float, lead_s: float) -> _Reference:
         """Remove speed and lead from slow axes, where they are mostly noise."""
         limit = self._settings.slow * zone

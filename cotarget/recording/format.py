@@ -4,7 +4,7 @@
     calibration.json       byte-for-byte copy of the run's calibration
     template.*             image of a target that is detected by a template
     log.jsonl              one JSON object a line, appended and flushed: the facts of the rig, then each call with its
-        arguments, result and time
+        arguments, result and time; an operator's order comes before the calls that it leads to
     fixed/ and zoom/       frames as PNG, numbered; the line that names an image is written after the image is complete
 
 If the program dies at any moment, the log is whole except for its last line, and every image that it names is on disk.
@@ -25,6 +25,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cotarget.config import RigConfig, parse_config
+from cotarget.control.orders import Order, parse_order
 from cotarget.control.selection import check_selector_table
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform
@@ -57,6 +58,7 @@ CALLS: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
     "head.move": ((4, 5), (2,)),  # pan, tilt, speed (of both axes or of each), wait -> pan, tilt
     "head.state": ((0,), (4, 5)),  # -> pan, tilt, moving, t, and sigma where it is not 0
     "head.halt": ((0,), (0,)),
+    "head.refused": ((0,), (0,)),  # the safety layer has refused a move of a stopped head; always an error
     "clock.now": ((0,), (1,)),
     "clock.sleep_until": ((1,), (0,)),
     "board.present": ((0, 6), (0,)),  # translation and rotation vector [rad], or no board
@@ -321,6 +323,7 @@ class Recording:
         selector_table: selection among several targets, see `cotarget.control.selection`; empty in older recordings.
         spec: spec of the recorded rig, with the head's own limits.
         events: every call on the rig, in order.
+        orders: an operator's orders, in order, each with the number of calls before it.
         ending: "complete", the error that ended the run, or where a truncated log breaks off.
         truncated: whether the log has no end; then the last step, which may be incomplete, is left out.
         notes: remarks for the user, one line each.
@@ -336,6 +339,7 @@ class Recording:
     ending: str
     truncated: bool
     notes: tuple[str, ...]
+    orders: tuple[tuple[int, Order], ...] = ()
 
     @property
     def steps(self) -> int:
@@ -368,7 +372,8 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
     target, selector_table, config = _parse_meta(directory, meta)
     if not (directory / CALIBRATION).is_file():
         raise ConfigError(f"{directory / CALIBRATION}: no such file; the recording is not whole")
-    spec, rows, ending = None, [], ""
+    spec, ending = None, ""
+    rows, orders = list[Event](), list[tuple[int, Order]]()
     stop = "the run stopped without an end"
     try:
         for number, row in _rows(directory / LOG):
@@ -376,6 +381,8 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
                 spec = _parsed(number, parse_spec, row["rig"], partial(describe, config))
             elif "end" in row:
                 ending = str(row["end"])
+            elif "order" in row:
+                orders.append((len(rows), _parsed(number, parse_order, row)))
             else:
                 rows.append(_with_image_on_disk(directory, _parsed(number, parse_event, row)))
     except _DamageError as damage:
@@ -406,6 +413,7 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
         ending or stop,
         truncated,
         tuple(notes),
+        tuple(orders),
     )
 
 

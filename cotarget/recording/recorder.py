@@ -25,8 +25,9 @@ import numpy as np
 
 import cotarget.errors
 from cotarget.config import RigConfig, config_table
+from cotarget.control.orders import Order, order_row
 from cotarget.control.selection import TargetSelector, selector_table
-from cotarget.errors import ConfigError, CotargetError
+from cotarget.errors import ConfigError, CotargetError, EmergencyStopError
 from cotarget.pipeline import Step
 from cotarget.recording.format import (
     CALIBRATION,
@@ -228,7 +229,7 @@ class _LoggedDevice:
         self._device = device
         for call in CALLS:
             of, method = call.split(".")
-            if of == name:
+            if of == name and call != "head.refused":
                 setattr(self, method, self._logged(call, method, log))
 
     def __getattr__(self, name: str) -> Any:
@@ -243,6 +244,25 @@ class _LoggedDevice:
             return log.call(call, getattr(self._device, method), bound.args[1:])
 
         return logged
+
+
+class _RefusalLog:
+    """A guarded head whose refused moves are logged; other attributes are the head's."""
+
+    def __init__(self, head: PanTilt, clock: Clock, writer: RecordWriter) -> None:
+        self._head, self._clock, self._writer = head, clock, writer
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._head, name)
+
+    def move(self, *args: Any, **kwargs: Any) -> tuple[float, float]:
+        """Command the head; log a refusal."""
+        try:
+            return self._head.move(*args, **kwargs)
+        except EmergencyStopError as error:
+            failure = (type(error).__name__, str(error))
+            self._writer.put(Event("head.refused", self._clock.now(), error=failure))
+            raise
 
 
 def known_class(error: Exception) -> str:
@@ -361,6 +381,14 @@ class Recorder(contextlib.AbstractContextManager["Recorder", None]):
         except BaseException:
             rig.close()
             raise
+
+    def with_refusals(self, rig: Rig) -> Rig:
+        """Return a guarded rig that also logs the moves which the safety layer refuses, for a run that goes on."""
+        return replace(rig, head=_RefusalLog(rig.head, rig.clock, self._writer))
+
+    def add(self, order: Order) -> None:
+        """Log an operator's order, in the run's thread before it is obeyed."""
+        self._writer.put(order_row(order))
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         """Write the rest of the queue and how the run ended; remove the recording if no rig was wrapped.

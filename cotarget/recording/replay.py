@@ -9,12 +9,13 @@ Commands move nothing: they are compared with the recorded ones (`Differences`),
 
 import math
 import threading
+from bisect import bisect_left
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +25,9 @@ from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.recording.format import COMPLETE, Event, Recording, argument_numbers, is_same
 from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Rig, Speed, ZoomState, to_step
+
+if TYPE_CHECKING:
+    from cotarget.control.orders import Order
 
 COMMANDS = ("head.move", "zoom.zoom", "head.halt")
 
@@ -131,6 +135,7 @@ class Replay:
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._spans, self._frames = _spans_and_frames(recording.events)
+        self._orders = deque(_orders_by_span(recording))
         self._differing: set[int] = set()  # places of the frames whose commands differ
         self._first: int | None = None  # the first of them
         self._broke_off = not recording.truncated and recording.ending != COMPLETE
@@ -170,6 +175,13 @@ class Replay:
         ending = self._recording.ending
         return self.breaks_off and str(error) in (ending, ending.partition(": ")[2])
 
+    def orders(self) -> "list[Order]":
+        """Return the operator's orders that came with the newest frame, or with one that was left out before it."""
+        found = []
+        while self._orders and self._orders[0][0] <= self._index:
+            found.append(self._orders.popleft()[1])
+        return found
+
     def take(self, call: str) -> Event | None:
         """Take the recorded event of a call between the same two frames; None if there is none.
 
@@ -183,6 +195,10 @@ class Replay:
         if event is None and self.breaks_off and not span.left(call) and not self._ended and call not in COMMANDS:
             raise self._end()
         return event
+
+    def refusal(self) -> Event | None:
+        """Take the event of a move that the safety layer refused between the same two frames; None if there is none."""
+        return None if self.is_aside else self._spans[self._index].take("head.refused")
 
     def play(self, event: Event) -> Event:
         """Advance the clock to an event, and raise its error if it has one.
@@ -302,6 +318,12 @@ def _spans_and_frames(events: Sequence[Event]) -> tuple[list[_Span], list[Event]
         else:
             spans[-1].add(event)
     return spans, frames
+
+
+def _orders_by_span(recording: Recording) -> "list[tuple[int, Order]]":
+    """Return the operator's orders, each with the place of its span."""
+    reads = [i for i, event in enumerate(recording.events) if event.call == "fixed.read" and not event.aside]
+    return [(bisect_left(reads, place), order) for place, order in recording.orders]
 
 
 def _recorded_error(name: str, message: str, error_class: str) -> CotargetError:
@@ -450,8 +472,13 @@ class _Head:
         return PanTiltState(pan, tilt, bool(moves), t, *sigma)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        recorded = self._replay.take("head.move")
+        refused, recorded = self._replay.refusal(), self._replay.take("head.move")
         args = argument_numbers("head.move", (pan, tilt, speed, wait))
+        if refused is not None:
+            if recorded is not None:  # the stop came while the device moved
+                self._replay.compare("head.move", recorded, args)
+            self._replay.take("head.halt")  # with which the safety layer answers a new stop
+            self._replay.play(refused)
         self._replay.compare("head.move", recorded, args)
         if recorded is not None:
             self._replay.play(recorded)

@@ -107,6 +107,7 @@ def test_rig_toml_defaults_to_what_is_listed():
     table, found = config_table(config), devices(config.hardware)
     table["hardware"] = {name: {"driver": next(iter(DRIVERS[name]))} | as_table(found[name].settings) for name in found}
     table["hardware"]["board"] = as_table(board_settings(config.hardware))
+    table["follow"] = as_table(config.follow)  # a recording has one key of it
     for key, default, _ in RIG_TOML:
         value = table
         for part in key.split("."):
@@ -141,6 +142,9 @@ def test_v010_rig_files_name_every_key():
         "follow.target",
         "follow.calibration",
         "follow.ignored",
+        "follow.when_idle",
+        "follow.idle_s",
+        "follow.unattended",
         *(f"hardware.{name}.driver" for name in DRIVERS),
     }
     assert {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in KEYS} - newer == found
