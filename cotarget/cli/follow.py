@@ -2,7 +2,9 @@
 
 import argparse
 import math
-from contextlib import nullcontext
+from contextlib import ExitStack, closing, nullcontext
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from cotarget.cli.common import (
@@ -15,6 +17,7 @@ from cotarget.cli.common import (
     print_json,
     rig_files,
 )
+from cotarget.cli.page_run import PageRun, add_page, check_page, demo_config, is_demo
 from cotarget.cli.pipeline_run import (
     RunInputs,
     Selection,
@@ -44,6 +47,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
     add_outputs(parser)
     add_file(parser, "--record", "record everything, for cotarget replay", "DIR")
+    add_page(parser)
     add_insist(parser)
 
 
@@ -57,6 +61,13 @@ def epilog() -> str:
 
 def run(options: argparse.Namespace) -> int:
     """Follow a target with the rig, and record it on request; return the exit status."""
+    check_page(options)
+    with ExitStack() as opened_first:
+        return _run(options, opened_first)
+
+
+def _run(options: argparse.Namespace, opened_first: ExitStack) -> int:
+    """Follow; what is opened before the rig is closed with the stack."""
     from cotarget.backends import describe, load_config
     from cotarget.calibration import Calibration
     from cotarget.pipeline import check_run
@@ -64,13 +75,19 @@ def run(options: argparse.Namespace) -> int:
     from cotarget.safety.safe_rig import guard
     from cotarget.safety.stop_file import refuse_if_stopped
 
-    config = load_config(options.rig)
+    demo = is_demo(options)
+    config = demo_config(options) if demo else load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
     spec = describe(config)
     name = options.target or config.follow.target or _only_target(spec, config)
     with naming("--target"):
         target = config.target(name)  # an unknown one is refused before the long work
+    page = PageRun(options, config, spec) if options.page else None
+    if page is not None:
+        opened_first.callback(page.close)
+    made = _demo_rig(config, opened_first) if demo else None
     file = options.calibration or config.follow.calibration or options.rig.parent / CALIBRATION
+    rig_there, file = (None, file) if made is None else made
     calibration = Calibration.load(file)
     check_outputs(output_files(options), [*rig_files(options.rig, config), file], options.record)
     check_run(calibration, spec, target, name, insist=options.insist, files=(file, options.rig))
@@ -83,18 +100,31 @@ def run(options: argparse.Namespace) -> int:
     ):
 
         def opened() -> "Rig":
-            rig = open_named(options.rig, config, guarded=False)
-            return guard(recorder.wrap(rig) if recorder else rig, config.safety)
+            rig = open_named(options.rig, config, guarded=False) if rig_there is None else rig_there
+            safe = guard(recorder.wrap(rig) if recorder else rig, config.safety if page is None else page.safety)
+            return recorder.with_refusals(safe) if recorder and page is not None else safe
 
         expected = None if math.isinf(seconds) else math.ceil(seconds * rate_hz)
-        run = RunInputs(opened, config, calibration, name, rate_hz, selection, seconds, expected)
+        operated = None if page is None else page.operated(recorder, seconds)
+        run = RunInputs(opened, config, calibration, name, rate_hz, selection, seconds, expected, operated=operated)
         result = run_observed(run, options)
         if result.interrupt is None:  # a run cut short may not have had the time to see anything
             warn_if_unseen("follow", run, result.counts)
         print_json(result.table, options.csv)
         if result.interrupt is not None:
             raise result.interrupt
-    return result.counts.exit_status
+    return result.counts.exit_status if page is None else 0
+
+
+def _demo_rig(config: "RigConfig", opened_first: ExitStack) -> "tuple[Rig, Path]":
+    """Open the simulated rig of a configuration; write its true calibration to a file."""
+    from cotarget.evaluation import true_calibration
+    from cotarget.sim.world import SimWorld
+
+    folder = Path(opened_first.enter_context(TemporaryDirectory(prefix="cotarget-")))
+    world = opened_first.enter_context(closing(SimWorld(config)))
+    true_calibration(world).save(folder / CALIBRATION)
+    return world.rig, folder / CALIBRATION
 
 
 def _only_target(spec: "RigSpec", config: "RigConfig") -> str:

@@ -322,7 +322,11 @@ class Reasons:
         self._steps = self._later_steps = 0
 
     def see(self, step: "Step") -> None:
-        """Count the reasons of a step."""
+        """Count the reasons of a step, but for those of an operator."""
+        from cotarget.pipeline import OPERATED
+
+        if step.state in OPERATED:
+            return
         latest = [part for part in step.reason.split("; ") if part]
         parts = {EITHER.sub(r"\1", NUMBER.sub(lambda found: found["name"] or ANY, part)): part for part in latest}
         self._steps += 1

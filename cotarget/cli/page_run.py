@@ -1,0 +1,139 @@
+"""Steer a run from a page: the options, the demo that needs no files, and the session with its page."""
+
+import argparse
+import dataclasses
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cotarget.cli.common import RIG, port
+from cotarget.errors import ConfigError
+from cotarget.safety.stop_file import locate_stop_file, refuse_if_stopped
+
+if TYPE_CHECKING:
+    import socket
+
+    from cotarget.config import RigConfig, SafetyConfig
+    from cotarget.pipeline import Run, Step
+    from cotarget.recording.recorder import Recorder
+    from cotarget.rig import Rig, RigSpec
+
+DEMO = "bird"  # target of the demo
+HARDWARE = "hardware"
+
+
+def add_page(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the page."""
+    about = f"serve a page to steer the run from; without {RIG} in the folder, it shows a simulated {DEMO}"
+    parser.add_argument("--page", action="store_true", help=about)
+    parser.add_argument("--page-port", type=port, metavar="P", help="port of the page; 0: any free one (8080)")
+    about = "name or address of this machine to serve at; without it only this machine reaches the page"
+    parser.add_argument("--page-host", metavar="HOST", help=about)
+
+
+def check_page(options: argparse.Namespace) -> None:
+    """Refuse options that only a page has, without one."""
+    for name in ("port", "host"):
+        if not options.page and getattr(options, f"page_{name}") is not None:
+            raise ConfigError(f"--page-{name}: needs --page")
+
+
+def is_demo(options: argparse.Namespace) -> bool:
+    """Whether the page is asked for in a folder without a rig.toml, and no other is named."""
+    return options.page and options.rig == RIG and not RIG.exists()
+
+
+def demo_config(options: argparse.Namespace) -> "RigConfig":
+    """Make the configuration of the demo's rig."""
+    from cotarget.demo import SCENES, sim_config
+
+    if options.calibration is not None:
+        raise ConfigError(f"--calibration: there is no {RIG} here, and the demo's rig has its true calibration")
+    name = options.target or DEMO
+    if name not in SCENES:
+        raise ConfigError(f"--target: there is no {RIG} here; the demo has one of: {', '.join(sorted(SCENES))}")
+    print(f"cotarget follow: there is no {RIG} here; this is the simulated {name} of the demo", file=sys.stderr)
+    return sim_config(SCENES[name], (name,), 0)
+
+
+class PageRun:
+    """The page of one run: its socket, its stop file, and the session.
+
+    Args:
+        options: the command's options.
+        config: configuration of the rig.
+        spec: the rig, as its configuration describes it.
+
+    Attributes:
+        safety: what the safety layer keeps; a simulation's stop file is the session's alone.
+    """
+
+    def __init__(self, options: argparse.Namespace, config: "RigConfig", spec: "RigSpec") -> None:
+        from cotarget.page.server import LOOPBACK, PORT, listen
+
+        self._options, self._config = options, config
+        self._stop_file: Path | None = config.safety.stop_file
+        if self._stop_file is None and config.backend != HARDWARE:
+            self._stop_file = locate_stop_file(options.rig, HARDWARE, None)
+        refuse_if_stopped(self._stop_file)
+        self.safety: SafetyConfig = config.safety
+        if not spec.real_time and config.backend != HARDWARE:
+            self.safety = dataclasses.replace(config.safety, stop_file=None)
+        self._host = options.page_host or LOOPBACK
+        self._listener: socket.socket = listen(self._host, PORT if options.page_port is None else options.page_port)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._listener.close()
+
+    def operated(self, recorder: "Recorder | None", seconds: float) -> "Callable[[Rig, Run], Iterator[Step]]":
+        """Make the function that yields the steps of a run under the page's operators."""
+        from cotarget.operate.session import Session
+        from cotarget.page.server import Page
+
+        def steps(rig: "Rig", run: "Run") -> "Iterator[Step]":
+            follow, real_time = self._config.follow, rig.spec.real_time
+            record = (lambda order: None) if recorder is None else recorder.add
+            session = Session(rig, run, self._stop_file, follow, time.monotonic, record)
+            folder = "" if recorder is None else str(self._options.record)
+            with Page(session, self._listener, self._host, folder) as page:
+                self._announce(page.link, follow.unattended)
+                for step in paced(session.steps(seconds), real_time, time.monotonic, time.sleep):
+                    page.show(step, rig.spec)
+                    yield step
+
+        return steps
+
+    def _announce(self, link: str, unattended: str) -> None:
+        """Print the link, and what it means."""
+        goes_on = "following goes on" if unattended == "follow" else "the head stands"
+        lines = [
+            f"open {link}",
+            f"the head stands until the page says otherwise; when the last page closes, {goes_on}: "
+            f'[follow] unattended = "{unattended}"',
+        ]
+        if self._options.page_host is not None:
+            number = self._listener.getsockname()[1]
+            lines.append(
+                "there is no encryption: who can read this network can read pictures and token, and steer; safer is, "
+                f"without --page-host: ssh -L {number}:127.0.0.1:{number} {self._host}, and the link on your machine"
+            )
+        for line in lines:
+            print(f"cotarget follow: {line}", file=sys.stderr, flush=True)
+
+
+def paced(
+    steps: "Iterator[Step]", real_time: bool, now: Callable[[], float], sleep: Callable[[float], None]
+) -> "Iterator[Step]":
+    """Yield steps no faster than in real time; a slow machine does not catch up afterwards."""
+    ahead = math.inf  # lead of the rig's clock over the wall clock
+    for step in steps:
+        yield step
+        if real_time:
+            continue
+        ahead = min(ahead, step.t - now())
+        if (wait := step.t - ahead - now()) > 0:
+            sleep(wait)

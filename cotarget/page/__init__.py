@@ -1,0 +1,1 @@
+"""Serve the page from which an operator steers a run."""
