@@ -1,6 +1,7 @@
 """Headless Chromium, driven by its DevTools protocol: a page, its pictures, mouse, touch and keys."""
 
 import base64
+import contextlib
 import itertools
 import json
 import os
@@ -28,25 +29,34 @@ class Browser:
     """One tab of a browser of its own; a context manager."""
 
     def __init__(self, folder: Path):
+        self._folder, self._open = folder, contextlib.ExitStack()
+        self._numbers, self.events, self._session = itertools.count(1), [], None
+
+    def __enter__(self):
+        with self._open:
+            self._start(self._folder)
+            self._open = self._open.pop_all()
+        return self
+
+    def _start(self, folder):
         root = ["--no-sandbox"] if os.geteuid() == 0 else []
         command = [find(), *FLAGS, *root, f"--user-data-dir={folder / 'profile'}", "about:blank"]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        self._open.callback(self._end)
         port_file = folder / "profile" / "DevToolsActivePort"
         until(port_file.exists)
         until(lambda: len(port_file.read_text().split()) == 2)
         number, path = port_file.read_text().split()
-        self._socket = connect(f"ws://127.0.0.1:{number}{path}", max_size=None)
-        self._numbers, self.events, self._session = itertools.count(1), [], None
+        self._socket = self._open.enter_context(connect(f"ws://127.0.0.1:{number}{path}", max_size=None))
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
 
-    def __enter__(self):
-        return self
-
     def __exit__(self, *_):
-        self._socket.close()
+        self._open.close()
+
+    def _end(self):
         self._process.terminate()
         self._process.wait(DEADLINE_S)
 
