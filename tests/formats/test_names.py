@@ -250,6 +250,9 @@ def test_point_prints_and_writes_what_is_listed(old, capsys):
         now = run(capsys, "point", "--rig", "rig_recording.toml", *arguments)
     assert_listed("printed.txt", {f"point: {key}" for key in keys_in(now)}, begins="point:")
     assert now["pan_deg"] == pytest.approx(5, abs=0.0514286)  # a step of the head
+    there = run(capsys, "home", "--rig", "rig_recording.toml")
+    assert (there["pan_deg"], there["tilt_deg"]) == (0.0, 0.0)
+    assert_listed("printed.txt", {f"home: {key}" for key in keys_in(there)}, begins="home:")
     found = run(capsys, "where", "--rig", "rig_recording.toml")
     assert_listed("printed.txt", {f"where: {key}" for key in keys_in(found)}, begins="where:")
     assert_listed("files.txt", {f"point --pictures: {path.name}" for path in Path("taken").iterdir()}, begins="point")

@@ -1,0 +1,87 @@
+"""cotarget follow --page: the demo, the stop file of a simulation, and what is refused."""
+
+import json
+import re
+import threading
+from types import SimpleNamespace
+
+import pytest
+
+from cotarget.page.server import LOOPBACK, listen
+from tests.support.commands import call, refused
+from tests.support.page_client import browser, picture, say, status
+
+DEADLINE_S = 60.0  # a busy machine draws slowly
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("option", [("--page-port", 0), ("--page-host", "localhost")])
+def test_options_of_the_page_need_a_page(folder, capsys, option):
+    assert "needs --page" in refused(capsys, "follow", *option)
+
+
+def test_a_port_that_is_taken_costs_one_line(folder, capsys):
+    with listen(LOOPBACK, 0) as taken:
+        said = refused_after_remark(capsys, "--page-port", taken.getsockname()[1])
+    assert "--page-port" in said
+
+
+def test_a_demo_without_its_target_is_refused(folder, capsys):
+    assert "bird" in refused(capsys, "follow", "--page", "--target", "dragon")
+
+
+def test_a_stop_survives_a_restart(folder, capsys):
+    (folder / "rig.stop").write_text("a hand in the gears\n")
+    said = refused_after_remark(capsys, "--page-port", 0)
+    assert "a hand in the gears" in said
+    assert "rig.stop" in said
+
+
+def refused_after_remark(capsys, *options):
+    status, out, err = call(capsys, "follow", "--page", *options)
+    assert (status, out) == (1, "")
+    remark, line = err.splitlines()
+    assert "simulated bird" in remark
+    return line
+
+
+@pytest.mark.render
+@pytest.mark.wire
+def test_the_demo_needs_no_file_and_is_steered_from_the_page(folder, capsys, monkeypatch):
+    """A browser that stops it: the file is there, the run goes on standing."""
+    links, done = [], []
+    monkeypatch.setattr("cotarget.cli.page_run.PageRun._announce", lambda self, link, unattended: links.append(link))
+
+    def steer():
+        while not links:
+            leave.wait(0.05)
+        port, token = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/#(.+)", links[0]).groups()
+        at = SimpleNamespace(port=int(port), page=SimpleNamespace(token=token))
+        with browser(at) as mine:
+            say(mine, do="take")
+            status(mine, lambda message: message["control"] == "you")
+            table, jpegs = picture(mine, DEADLINE_S)
+            assert table["heads"]["head"]["state"] == "standing"
+            assert set(jpegs) == {"fixed", "zoom"}
+            say(mine, do="stop")
+            status(mine, lambda message: message["stopped"] is not None)
+            done.append((folder / "rig.stop").read_text())
+            status(mine)
+
+    leave, steering = threading.Event(), threading.Thread(target=steer)
+    steering.start()
+    code, out, _ = call(capsys, "follow", "--page", "--page-port", 0, "--seconds", 4, "--record", "run")
+    steering.join()
+    assert code == 0
+    assert done == ["stopped from the page\n"]
+    assert set(json.loads(out)["states"]) >= {"standing"}
+    log = (folder / "run" / "log.jsonl").read_text()
+    assert '"order": "stop"' in log
+    assert links[0].partition("#")[2] not in log  # nor the token
+    assert links[0].partition("#")[2] not in (folder / "run" / "recording.json").read_text()
+    assert call(capsys, "replay", "run", "--check")[0] == 0
