@@ -17,7 +17,7 @@ from cotarget.cli.common import (
     print_json,
     rig_files,
 )
-from cotarget.cli.page_run import PageRun, add_page, check_page, demo_config, is_demo
+from cotarget.cli.page_run import PageRun, Recordings, add_page, check_page, demo_config, is_demo
 from cotarget.cli.pipeline_run import (
     RunInputs,
     Selection,
@@ -70,7 +70,7 @@ def _run(options: argparse.Namespace, opened_first: ExitStack) -> int:
     """Follow; what is opened before the rig is closed with the stack."""
     from cotarget.backends import describe, load_config
     from cotarget.calibration import Calibration
-    from cotarget.pipeline import check_run
+    from cotarget.pipeline import Run, check_run
     from cotarget.recording.recorder import Recorder
     from cotarget.safety.safe_rig import guard
     from cotarget.safety.stop_file import refuse_if_stopped
@@ -93,19 +93,24 @@ def _run(options: argparse.Namespace, opened_first: ExitStack) -> int:
     check_run(calibration, spec, target, name, insist=options.insist, files=(file, options.rig))
     selection, rate_hz = Selection(options, spec.fixed.size), spec.fixed.rate_hz
     seconds = math.inf if options.seconds is None else options.seconds
-    with (
-        Recorder(options.record, config, file, name, selection.selector)
-        if options.record
-        else nullcontext() as recorder
-    ):
+
+    def make_recorder(folder: Path) -> Recorder:
+        return Recorder(folder, config, file, name, selection.selector)
+
+    def make_run(rig: "Rig") -> Run:
+        return Run(rig, calibration, target, selector=Selection(options, spec.fixed.size).selector)
+
+    records = None if page is None else opened_first.enter_context(Recordings(options.record, make_recorder))
+    with make_recorder(options.record) if options.record and page is None else nullcontext() as recorder:
 
         def opened() -> "Rig":
             rig = open_named(options.rig, config, guarded=False) if rig_there is None else rig_there
-            safe = guard(recorder.wrap(rig) if recorder else rig, config.safety if page is None else page.safety)
-            return recorder.with_refusals(safe) if recorder and page is not None else safe
+            if page is None or records is None:
+                return guard(recorder.wrap(rig) if recorder else rig, config.safety)
+            return records.with_refusals(guard(records.wrap(rig), page.safety))
 
         expected = None if math.isinf(seconds) else math.ceil(seconds * rate_hz)
-        operated = None if page is None else page.operated(recorder, seconds)
+        operated = None if page is None or records is None else page.operated(records, make_run, seconds)
         run = RunInputs(opened, config, calibration, name, rate_hz, selection, seconds, expected, operated=operated)
         result = run_observed(run, options)
         if result.interrupt is None:  # a run cut short may not have had the time to see anything

@@ -1,24 +1,29 @@
 """Steer a run from a page: the options, the demo that needs no files, and the session with its page."""
 
 import argparse
+import contextlib
 import dataclasses
+import itertools
 import math
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import TracebackType
+from typing import TYPE_CHECKING, cast
 
 from cotarget.cli.common import RIG, port
-from cotarget.errors import ConfigError
+from cotarget.errors import ConfigError, CotargetError
 from cotarget.safety.stop_file import locate_stop_file, refuse_if_stopped
 
 if TYPE_CHECKING:
     import socket
 
     from cotarget.config import RigConfig, SafetyConfig
+    from cotarget.control.orders import Order
     from cotarget.pipeline import Run, Step
-    from cotarget.recording.recorder import Recorder
+    from cotarget.recording.recorder import RecordedRig, Recorder
     from cotarget.rig import Rig, RigSpec
 
 DEMO = "bird"  # target of the demo
@@ -89,19 +94,20 @@ class PageRun:
         """Close the socket."""
         self._listener.close()
 
-    def operated(self, recorder: "Recorder | None", seconds: float) -> "Callable[[Rig, Run], Iterator[Step]]":
+    def operated(
+        self, recordings: "Recordings", make_run: "Callable[[Rig], Run]", seconds: float
+    ) -> "Callable[[Rig, Run], Iterator[Step]]":
         """Make the function that yields the steps of a run under the page's operators."""
         from cotarget.operate.session import Session
         from cotarget.page.server import Page
 
         def steps(rig: "Rig", run: "Run") -> "Iterator[Step]":
-            follow, real_time = self._config.follow, rig.spec.real_time
-            record = (lambda order: None) if recorder is None else recorder.add
-            session = Session(rig, run, self._stop_file, follow, time.monotonic, record)
-            folder = "" if recorder is None else str(self._options.record)
-            with Page(session, self._listener, self._host, folder) as page:
+            follow = self._config.follow
+            recordings.make_run = lambda: make_run(rig)
+            session = Session(rig, run, self._stop_file, follow, time.monotonic, recordings)
+            with Page(session, self._listener, self._host) as page:
                 self._announce(page.link, follow.unattended)
-                for step in paced(session.steps(seconds), real_time, time.monotonic, time.sleep):
+                for step in paced(session.steps(seconds), rig.spec.real_time, time.monotonic, time.sleep):
                     page.show(step, rig.spec)
                     yield step
 
@@ -123,6 +129,89 @@ class PageRun:
             )
         for line in lines:
             print(f"cotarget follow: {line}", file=sys.stderr, flush=True)
+
+
+class Recordings(contextlib.AbstractContextManager["Recordings", None]):
+    """The recordings of a session, one after another; the last ends with the session.
+
+    Args:
+        first: folder of the recording that begins with the session; None for none.
+        make: makes the recorder of a folder.
+
+    Attributes:
+        folder: folder of the recording; empty while nothing is recorded.
+        make_run: makes a new run on the open rig.
+    """
+
+    def __init__(self, first: Path | None, make: "Callable[[Path], Recorder]") -> None:
+        self.folder, self.make_run = "", cast("Callable[[], Run]", None)
+        self._base, self._make = first or Path("recording"), make
+        self._recorder: Recorder | None = None
+        self._rig: RecordedRig | None = None
+        self._completing: list[threading.Thread] = []
+        if first is not None:
+            self._take(first)
+
+    def wrap(self, rig: "Rig") -> "Rig":
+        """Return the rig with devices that can be recorded; closing it closes the rig."""
+        from cotarget.recording.recorder import RecordedRig
+
+        self._rig = RecordedRig(rig)
+        if self._recorder is not None:
+            self._recorder.begin(self._rig)
+        return self._rig.devices
+
+    def with_refusals(self, rig: "Rig") -> "Rig":
+        """Return the guarded rig whose refused moves are recorded too."""
+        assert self._rig is not None, "it is wrapped before it is guarded"
+        return self._rig.with_refusals(rig)
+
+    def add(self, order: "Order") -> None:
+        """Record an order, if anything is recorded."""
+        if self._recorder is not None:
+            self._recorder.add(order)
+
+    def begin(self) -> "Run":
+        """Record to the next free folder, from a new run on.
+
+        Raises:
+            ConfigError: the folder cannot be written.
+        """
+        assert self._rig is not None, "the rig is open"
+        names = (self._base.with_name(f"{self._base.name}-{n}") for n in itertools.count(2))
+        self._take(next(name for name in itertools.chain([self._base], names) if not name.exists()))
+        assert self._recorder is not None, "it was made"
+        self._recorder.begin(self._rig)
+        return self.make_run()
+
+    def end(self) -> None:
+        """Complete the recording, while the run goes on."""
+        if self._rig is not None and self._recorder is not None:
+            self._rig.end()
+            thread = threading.Thread(target=_complete, args=(self._recorder,), name="cotarget-end-of-recording")
+            self._completing.append(thread)
+            self._recorder, self.folder = None, ""
+            thread.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete all recordings, after the rig was closed."""
+        for thread in self._completing:
+            thread.join()
+        if self._recorder is not None:
+            self._recorder.__exit__(kind, error, trace)
+
+    def _take(self, folder: Path) -> None:
+        self._recorder, self.folder = self._make(folder), str(folder)
+
+
+def _complete(recorder: "Recorder") -> None:
+    """Write the rest of a recording, whatever becomes of it."""
+    try:
+        recorder.__exit__(None, None, None)
+    except CotargetError as error:
+        print(f"cotarget follow: {error}", file=sys.stderr)
 
 
 def paced(

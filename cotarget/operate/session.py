@@ -4,10 +4,11 @@ The session's own thread is the run's. The methods that give orders may be calle
 with its next frame. Only a stop does not wait for a frame: on a rig in real time it halts the head at once.
 """
 
-import logging
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 from cotarget.config import FollowConfig
 from cotarget.control.orders import MANUAL_S, Order
@@ -16,11 +17,28 @@ from cotarget.pipeline import HEAD, Mode, Run, State, Step
 from cotarget.rig import Rig
 from cotarget.safety.stop_file import StopLook, clear_stop_file, write_stop_file
 
-log = logging.getLogger(__name__)
-
 
 class ControlError(CotargetError):
     """Somebody else has control."""
+
+
+class Records(Protocol):
+    """What records a session, when it is asked to.
+
+    Attributes:
+        folder: folder of the recording; empty while nothing is recorded.
+    """
+
+    folder: str
+
+    def add(self, order: Order) -> None:
+        """Record an order before the run obeys it, if anything is recorded."""
+
+    def begin(self) -> Run:
+        """Record from now on, and make the new run that the recording begins with."""
+
+    def end(self) -> None:
+        """Complete the recording."""
 
 
 class Session:
@@ -32,11 +50,12 @@ class Session:
         stop_file: stop file of the session; a stop is written there too, and lasts until it is cleared.
         config: what happens when nothing is followed, and without an operator.
         now: time on the wall [s], for orders by hand that end.
-        record: takes every order before the run obeys it.
+        records: records it; None for none.
 
     Attributes:
         control: who has control; None for nobody.
         stopped: reason of the stop; None if the heads may move.
+        notice: what went wrong last in the run's thread, as a sentence; empty if nothing did.
     """
 
     def __init__(
@@ -46,10 +65,10 @@ class Session:
         stop_file: Path | None,
         config: FollowConfig,
         now: Callable[[], float],
-        record: Callable[[Order], None] = lambda order: None,
+        records: Records | None = None,
     ) -> None:
         self.control: str | None = None
-        self._rig, self._run, self._config, self._now, self._record = rig, run, config, now, record
+        self._rig, self._run, self._config, self._now, self._records = rig, run, config, now, records
         self._stop_file = stop_file
         # A rig in real time watches its stop file by itself; in a simulation the run asks between two frames.
         self._look = StopLook(None if rig.spec.real_time else stop_file)
@@ -58,6 +77,8 @@ class Session:
         self._turning: dict[str, tuple[tuple[float, float], float]] = {}  # rates by head, and when they end
         self._to_clear = False
         self.stopped: str | None = None
+        self.notice = ""
+        self._to_record: bool | None = None
         self._idle_since: float | None = None
 
     @property
@@ -145,6 +166,23 @@ class Session:
         with self._lock:
             self._to_clear, self._orders, self._turning = True, [], {}
 
+    @property
+    def recording(self) -> str:
+        """Folder of the recording; empty while nothing is recorded."""
+        return "" if self._records is None else self._records.folder
+
+    def record(self, on: bool, *, by: str | None = None) -> None:
+        """Begin a recording, or complete it.
+
+        A recording begins with a new run, so that its replay knows all that the run does: tracks begin anew, and a
+        head that followed follows again as soon as there is a track.
+        """
+        self._refuse_other(by)
+        if self._records is None:
+            raise ConfigError("this session cannot be recorded")
+        with self._lock:
+            self._to_record = on
+
     # Control
 
     def take(self, who: str) -> None:
@@ -198,12 +236,43 @@ class Session:
 
     def steps(self, seconds: float) -> Iterator[Step]:
         """Yield the run's steps, for a time on the rig's clock [s]."""
+        end, steps = self._rig.clock.now() + seconds, 0
         try:
-            for step in self._run.follow(seconds, self._due):
-                self._notice(step)
-                yield step
+            while True:
+                first = steps
+                for step in self._run.follow(end - self._rig.clock.now(), self._due):
+                    steps = first + step.index + 1
+                    self._notice(step)
+                    yield replace(step, index=steps - 1)
+                    if self._renewed(step):
+                        break
+                else:
+                    return
         finally:
             self._look.close()
+
+    def _renewed(self, step: Step) -> bool:
+        """Begin or complete a recording where that is wanted; return whether there is a new run."""
+        with self._lock:
+            wanted, self._to_record = self._to_record, None
+        if wanted is None or self._records is None or wanted == bool(self._records.folder):
+            return False
+        before = self._run.head.mode
+        try:
+            if not wanted:
+                self._records.end()
+                return False
+            self._run = self._records.begin()
+        except CotargetError as error:
+            self.notice = str(error)
+            return False
+        order = Order("stand", HEAD)
+        if before is Mode.FOLLOWING:
+            u, v = (None, None) if step.target is None else step.target.center_px.tolist()
+            order = Order("follow", HEAD, click=None if u is None or v is None else (u, v))
+        with self._lock:
+            self._orders.insert(0, order)
+        return True
 
     def _due(self) -> list[Order]:
         """Take the orders that the run obeys with the newest frame, and record them."""
@@ -222,8 +291,9 @@ class Session:
             if self.stopped is not None:
                 self._turning = {}
             orders += self._by_hand()
-        for order in orders:
-            self._record(order)
+        if self._records is not None:
+            for order in orders:
+                self._records.add(order)
         return orders
 
     def _by_hand(self) -> list[Order]:
@@ -245,7 +315,7 @@ class Session:
             try:
                 clear_stop_file(self._stop_file)
             except CotargetError as error:
-                log.warning("%s", error)
+                self.notice = str(error)
                 return False
         return clear
 

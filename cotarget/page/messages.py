@@ -55,6 +55,13 @@ class Simple(Message):
     do: Literal["stop", "clear", "take"]
 
 
+class Record(Message):
+    """Begin a recording, or complete it."""
+
+    do: Literal["record"]
+    on: bool
+
+
 class ToHead(Message):
     """Let a head stand, or send it home."""
 
@@ -89,7 +96,7 @@ class Zoom(Message):
     tick: int
 
 
-Incoming = Hello | Drawn | Simple | ToHead | Follow | Manual | Zoom
+Incoming = Hello | Drawn | Simple | Record | ToHead | Follow | Manual | Zoom
 PARSER: TypeAdapter[Incoming] = TypeAdapter(Annotated[Incoming, Field(discriminator="do")])
 
 

@@ -36,6 +36,7 @@ from cotarget.page.messages import (
     Hello,
     Incoming,
     Manual,
+    Record,
     Simple,
     ToHead,
     Zoom,
@@ -139,15 +140,14 @@ class Page:
         session: the session that browsers steer.
         listener: socket to serve on, see `listen`; closed with the page.
         host: the name that it was given to listen at.
-        recording: folder of the run's recording; empty for none.
 
     Attributes:
         link: address of the page, with the token.
         token: what a browser has to know.
     """
 
-    def __init__(self, session: Session, listener: socket.socket, host: str = LOOPBACK, recording: str = "") -> None:
-        self._session, self._listener, self._recording = session, listener, recording
+    def __init__(self, session: Session, listener: socket.socket, host: str = LOOPBACK) -> None:
+        self._session, self._listener = session, listener
         self._hosts = {"localhost", LOOPBACK, "[::1]", host.lower(), f"[{host.lower()}]"}
         self.token = secrets.token_urlsafe(TOKEN_BYTES)
         name = f"[{host}]" if ":" in host else host
@@ -357,6 +357,8 @@ class Page:
                 session.clear(by=who)
             case Simple(do="take"):
                 session.take(who)
+            case Record():
+                session.record(message.on, by=who)
             case ToHead(do="stand"):
                 session.stand(message.of, by=who)
             case ToHead():
@@ -391,7 +393,8 @@ class Page:
                 "stopped": session.stopped,
                 "control": "nobody" if control is None else "you" if control == client.who else "another",
                 "pages": len(self._clients),
-                "recording": self._recording,
+                "recording": session.recording,
+                "notice": session.notice,
             }
             await client.socket.send(json.dumps(status))
             await asyncio.sleep(TICK_S)

@@ -197,28 +197,33 @@ PROTOCOLS = {"fixed": Camera, "zoom": ZoomCamera, "head": PanTilt, "clock": Cloc
 
 
 class _CallLog:
-    """Log of the calls on all devices of a rig, made in the run's thread."""
+    """Log of the calls on all devices of a rig, made in the run's thread.
 
-    def __init__(self, clock: Clock, writer: RecordWriter) -> None:
-        self._clock, self._writer, self._thread = clock, writer, threading.get_ident()
+    Attributes:
+        writer: writes them; None while nothing is recorded.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self.writer: RecordWriter | None = None
+        self._clock, self._thread = clock, threading.get_ident()
 
     def call(self, name: str, method: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         """Call a device, and log the result or the error; a frame is logged with its image."""
-        aside = threading.get_ident() != self._thread
-        if aside and name == "clock.now":  # the watchdog's thread reads the clock all the time
-            return method()
+        aside, writer = threading.get_ident() != self._thread, self.writer
+        if writer is None or (aside and name == "clock.now"):  # the watchdog's thread reads the clock all the time
+            return method(*arguments)
         args = argument_numbers(name, arguments)
         try:
             answer = method(*arguments)
         except Exception as error:
             failure = (type(error).__name__, str(error))
             event = Event(name, self._clock.now(), args, error=failure, error_class=known_class(error), aside=aside)
-            self._writer.put(event)
+            writer.put(event)
             raise
         result = result_numbers(answer)
         at = answer if name == "clock.now" else self._clock.now()
         frame = answer if isinstance(answer, Frame) else None
-        self._writer.put(Event(name, at, args, result, aside=aside), name.split(".")[0], frame)
+        writer.put(Event(name, at, args, result, aside=aside), name.split(".")[0], frame)
         return answer
 
 
@@ -249,8 +254,8 @@ class _LoggedDevice:
 class _RefusalLog:
     """A guarded head whose refused moves are logged; other attributes are the head's."""
 
-    def __init__(self, head: PanTilt, clock: Clock, writer: RecordWriter) -> None:
-        self._head, self._clock, self._writer = head, clock, writer
+    def __init__(self, head: PanTilt, clock: Clock, calls: _CallLog) -> None:
+        self._head, self._clock, self._calls = head, clock, calls
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._head, name)
@@ -260,9 +265,43 @@ class _RefusalLog:
         try:
             return self._head.move(*args, **kwargs)
         except EmergencyStopError as error:
-            failure = (type(error).__name__, str(error))
-            self._writer.put(Event("head.refused", self._clock.now(), error=failure))
+            if (writer := self._calls.writer) is not None:
+                failure = (type(error).__name__, str(error))
+                writer.put(Event("head.refused", self._clock.now(), error=failure))
             raise
+
+
+class RecordedRig:
+    """A rig whose calls are recorded while a recorder is on; of the rig itself, `devices` has the logged devices.
+
+    Args:
+        rig: a rig without a safety layer, which the caller closes.
+
+    Raises:
+        ConfigError: the rig is guarded; the log must hold the commands that the devices receive.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        if rig.guard is not None:
+            raise ConfigError(
+                "a guarded rig is not recorded: open it by open_rig(..., guarded=False), and guard what wrap returns"
+            )
+        self._rig, self._calls = rig, _CallLog(rig.clock)
+        devices: dict[str, Any] = {name: _LoggedDevice(name, getattr(rig, name), self._calls) for name in PROTOCOLS}
+        self.devices = replace(rig, **devices)
+
+    def with_refusals(self, rig: Rig) -> Rig:
+        """Return the guarded rig that also logs the moves which the safety layer refuses, for a run that goes on."""
+        return replace(rig, head=_RefusalLog(rig.head, rig.clock, self._calls))
+
+    def begin(self, writer: RecordWriter) -> None:
+        """Record from now on."""
+        writer.put({"rig": spec_table(self._rig.spec)})
+        self._calls.writer = writer
+
+    def end(self) -> None:
+        """Record no more."""
+        self._calls.writer = None
 
 
 def known_class(error: Exception) -> str:
@@ -367,24 +406,19 @@ class Recorder(contextlib.AbstractContextManager["Recorder", None]):
         Raises:
             ConfigError: the rig is guarded; the log must hold the commands that the devices receive.
         """
-        assert not self._wrapped, "a recording is of one rig"
-        if rig.guard is not None:
-            raise ConfigError(
-                "a guarded rig is not recorded: open it by open_rig(..., guarded=False), and guard what wrap returns"
-            )
-        self._wrapped = True
         try:
-            self._writer.put({"rig": spec_table(rig.spec)})
-            calls = _CallLog(rig.clock, self._writer)
-            devices: dict[str, Any] = {name: _LoggedDevice(name, getattr(rig, name), calls) for name in PROTOCOLS}
-            return replace(rig, **devices)
+            recorded = RecordedRig(rig)
+            self.begin(recorded)
         except BaseException:
             rig.close()
             raise
+        return recorded.devices
 
-    def with_refusals(self, rig: Rig) -> Rig:
-        """Return a guarded rig that also logs the moves which the safety layer refuses, for a run that goes on."""
-        return replace(rig, head=_RefusalLog(rig.head, rig.clock, self._writer))
+    def begin(self, recorded: RecordedRig) -> None:
+        """Record a rig from now on; only one is recorded."""
+        assert not self._wrapped, "a recording is of one rig"
+        recorded.begin(self._writer)
+        self._wrapped = True
 
     def add(self, order: Order) -> None:
         """Log an operator's order, in the run's thread before it is obeyed."""

@@ -9,7 +9,7 @@ import pytest
 
 from cotarget.page.server import LOOPBACK, listen
 from tests.support.commands import call, refused
-from tests.support.page_client import browser, picture, say, status
+from tests.support.page_client import browser, picture, say, status, until
 
 DEADLINE_S = 60.0  # a busy machine draws slowly
 
@@ -50,6 +50,22 @@ def refused_after_remark(capsys, *options):
     return line
 
 
+def at_link(links):
+    """What a browser needs, once the link is there."""
+    until(lambda: links, DEADLINE_S)
+    port, token = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/#(.+)", links[0]).groups()
+    return SimpleNamespace(port=int(port), page=SimpleNamespace(token=token))
+
+
+def steered(capsys, steer, *options):
+    """Status and stdout of a run that a thread steers."""
+    steering = threading.Thread(target=steer)
+    steering.start()
+    code, out, _ = call(capsys, "follow", "--page", "--page-port", 0, *options)
+    steering.join()
+    return code, out
+
+
 @pytest.mark.render
 @pytest.mark.wire
 def test_the_demo_needs_no_file_and_is_steered_from_the_page(folder, capsys, monkeypatch):
@@ -58,11 +74,7 @@ def test_the_demo_needs_no_file_and_is_steered_from_the_page(folder, capsys, mon
     monkeypatch.setattr("cotarget.cli.page_run.PageRun._announce", lambda self, link, unattended: links.append(link))
 
     def steer():
-        while not links:
-            leave.wait(0.05)
-        port, token = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/#(.+)", links[0]).groups()
-        at = SimpleNamespace(port=int(port), page=SimpleNamespace(token=token))
-        with browser(at) as mine:
+        with browser(at_link(links)) as mine:
             say(mine, do="take")
             status(mine, lambda message: message["control"] == "you")
             table, jpegs = picture(mine, DEADLINE_S)
@@ -73,10 +85,7 @@ def test_the_demo_needs_no_file_and_is_steered_from_the_page(folder, capsys, mon
             done.append((folder / "rig.stop").read_text())
             status(mine)
 
-    leave, steering = threading.Event(), threading.Thread(target=steer)
-    steering.start()
-    code, out, _ = call(capsys, "follow", "--page", "--page-port", 0, "--seconds", 4, "--record", "run")
-    steering.join()
+    code, out = steered(capsys, steer, "--record", "run", "--seconds", 4)
     assert code == 0
     assert done == ["stopped from the page\n"]
     assert set(json.loads(out)["states"]) >= {"standing"}
@@ -85,3 +94,32 @@ def test_the_demo_needs_no_file_and_is_steered_from_the_page(folder, capsys, mon
     assert links[0].partition("#")[2] not in log  # nor the token
     assert links[0].partition("#")[2] not in (folder / "run" / "recording.json").read_text()
     assert call(capsys, "replay", "run", "--check")[0] == 0
+
+
+@pytest.mark.render
+@pytest.mark.wire
+def test_a_recording_that_begins_in_the_middle_replays(folder, capsys, monkeypatch):
+    links, seen = [], []
+    monkeypatch.setattr("cotarget.cli.page_run.PageRun._announce", lambda self, link, unattended: links.append(link))
+
+    def steer():
+        with browser(at_link(links)) as mine:
+            say(mine, do="take")
+            status(mine, lambda message: message["control"] == "you")
+            say(mine, do="follow", of="head")
+            for on in (True, False, True):
+                say(mine, do="record", on=on)
+                seen.append(status(mine, lambda message: bool(message["recording"]) == on)["recording"])  # noqa: B023
+                for _ in range(3):  # some steps of it
+                    say(mine, do="drawn", n=0)
+                    assert picture(mine, DEADLINE_S)
+
+    code, _ = steered(capsys, steer, "--seconds", 4)
+    assert code == 0
+    assert seen == ["recording", "", "recording-2"]
+    for name in ("recording", "recording-2"):
+        code, out, err = call(capsys, "replay", name, "--check")
+        assert code == 0, err
+        assert json.loads(out)["steps"] >= 2
+        lines = (folder / name / "log.jsonl").read_text().splitlines()
+        assert json.loads(lines[-1])["end"] == "complete"

@@ -143,6 +143,15 @@ def test_a_click_follows_the_track_or_the_place(browser, at):
     assert place == pytest.approx((399.5, 299.5), abs=PLACE_PX)
 
 
+def test_record_begins_and_completes_a_recording(browser, at):
+    browser.click("record")
+    until(lambda: noted(at, "record") == [("record", True)])
+    at.session.recording = "recording"
+    until(lambda: browser.text("recording") == "recording")
+    browser.click("record")
+    until(lambda: noted(at, "record")[1:] == [("record", False)])
+
+
 def test_a_drag_in_the_close_up_turns_and_the_wheel_zooms(browser, at):
     x, y = browser.center("zoom")
     browser.mouse("mousePressed", (x, y), button="left", clickCount=1)

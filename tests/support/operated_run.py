@@ -3,6 +3,7 @@
 import math
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from cotarget.calibration import Calibration
 from cotarget.config import FollowConfig
 from cotarget.operate.session import Session
 from cotarget.pipeline import Run
-from cotarget.recording.recorder import Recorder
+from cotarget.recording.recorder import RecordedRig, Recorder
 from cotarget.safety.safe_rig import guard
 from tests.support.recorded_run import CONFIG, SETTINGS, SPEED, Bright, ToyDevices, ToyHead
 from tests.support.rigs import rig_of
@@ -52,13 +53,16 @@ def operate(path, steps, act, *, folder=None, stop_file=None, config=None, devic
     with Recorder(folder, CONFIG, path, "bird") if folder else nullcontext() as recorder:
         rig = rig_of(devices)
         safety = replace(CONFIG.safety, stop_file=guard_file)
-        safe = guard(recorder.wrap(rig) if recorder else rig, safety)
+        recorded = RecordedRig(rig)
         if recorder:
-            safe = recorder.with_refusals(safe)
+            recorder.begin(recorded)
+        safe = guard(recorded.devices if recorder else rig, safety)
+        if recorder:
+            safe = recorded.with_refusals(safe)
         with safe:
             run = Run(safe, Calibration.load(path), CONFIG.target("bird"), Bright(), settings=SETTINGS)
-            record = recorder.add if recorder else (lambda order: None)
-            session = Session(safe, run, stop_file, config or FollowConfig(), wall, record)
+            records = SimpleNamespace(add=recorder.add, folder=str(folder)) if recorder else None
+            session = Session(safe, run, stop_file, config or FollowConfig(), wall, records)
             for i, step in enumerate(session.steps(math.inf)):
                 done.append(step)
                 if i + 1 == steps:

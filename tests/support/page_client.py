@@ -27,6 +27,7 @@ class NotingSession:
 
     def __init__(self):
         self.control, self.stopped, self.noted = None, None, []
+        self.recording = self.notice = ""
         self.left_alone = lambda: self.noted.append(("left alone",))
 
     def _note(self, what, *args, by):
@@ -50,6 +51,9 @@ class NotingSession:
 
     def zoom(self, head, factor, *, by):
         self._note("zoom", head, factor, by=by)
+
+    def record(self, on, *, by):
+        self._note("record", on, by=by)
 
     def clear(self, *, by):
         self._note("clear", by=by)
