@@ -4,7 +4,9 @@ A way opens its device for the length of a with block, and gives it with its clo
 while it keeps the promise, and then has to keep it in the replay.
 """
 
+import atexit
 import contextlib
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -102,12 +104,17 @@ def rtsp():
             yield camera, MonotonicClock()
 
 
+@functools.cache
+def s5is_port():
+    """An emulated S5 IS for all promises, because its process takes a second to start; its port."""
+    kept = contextlib.ExitStack()
+    atexit.register(kept.close)
+    return kept.enter_context(s5is_process()).port
+
+
 @contextlib.contextmanager
 def s5is():
-    with (
-        s5is_process() as process,
-        contextlib.closing(GphotoCamera(GphotoSettings(port=process.port), MonotonicClock())) as camera,
-    ):
+    with contextlib.closing(GphotoCamera(GphotoSettings(port=s5is_port()), MonotonicClock())) as camera:
         yield camera, MonotonicClock()
 
 
