@@ -59,7 +59,7 @@ def test_a_real_bird_is_followed_as_a_speck(clip, tmp_path):
     assert result.false_tracks == 0  # one in these 43 s would be more than one a minute
 
 
-@pytest.mark.parametrize("clip", ["V_BIRD_036", "V_BIRD_034"])
+@pytest.mark.parametrize("clip", ["V_BIRD_036", pytest.param("V_BIRD_034", marks=pytest.mark.slow)])
 def test_a_real_bird_is_followed_by_the_detector_for_any_kind(clip, tmp_path):
     result = watch(clip, "auto", tmp_path)
     assert result.on_target_ratio >= LEAST_COVERAGE
