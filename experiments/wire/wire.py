@@ -221,7 +221,7 @@ SETTINGS = WireSettings(seeds=1)
 QUICK = replace(
     SETTINGS,
     poll_s=2.0,
-    age_s=6.0,
+    age_s=4.0,
     targets=("book",),
     command_s=6.0,
     faults=("head.silence", "fixed.stall"),
