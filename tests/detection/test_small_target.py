@@ -86,7 +86,7 @@ def test_a_bird_that_hovers_on_the_spot_is_followed_and_what_stands_is_not():
         assert np.linalg.norm(track.center_px - (100, 80)) < 3.0
 
 
-@pytest.mark.parametrize("size", [4, 8, 16, 32, 56])
+@pytest.mark.parametrize("size", [4, 16, 56])
 def test_small_targets_of_all_sizes_are_found_where_they_are(size):
     speed = max(1.7, 0.1 * size)  # a tenth of itself a frame; px
 
@@ -127,7 +127,7 @@ def test_a_spot_in_a_large_picture_is_found_before_a_sky_and_not_among_leaves(ro
     assert any(x <= 639 < x + w and y <= 479 < y + h for x, y, w, h in boxes) == found
 
 
-@pytest.mark.parametrize(("length", "step"), [(12, 1), (12, 2), (24, 2), (24, 4), (40, 3)])
+@pytest.mark.parametrize(("length", "step"), [(12, 1), (24, 4), (40, 3)])
 def test_all_of_a_plain_bird_is_boxed_though_only_its_front_is_new(length, step):
     """It moves by less than its own length in the shortest time over which pictures are compared."""
 
@@ -198,7 +198,7 @@ def test_a_bird_in_front_of_rough_ground_is_found_at_a_hundred_frames_a_second()
     assert np.mean(on[100:]) > 0.9
 
 
-@pytest.mark.parametrize("times", [1, 2, 3])
+@pytest.mark.parametrize("times", [1, 3])
 def test_a_bird_of_a_pixel_is_found_in_a_small_picture(times):
     """A film in half and a third of its size: the bird is 1.3 px long."""
 
@@ -224,7 +224,7 @@ def test_a_bird_of_a_pixel_is_found_in_a_small_picture(times):
     assert np.median(off) < 0.2
 
 
-@pytest.mark.parametrize(("width", "height", "noise"), [(240, 180, 2.0), (240, 180, 8.0), (320, 240, 4.0)])
+@pytest.mark.parametrize(("width", "height", "noise"), [(240, 180, 8.0), (320, 240, 4.0)])
 def test_noise_alone_makes_no_track(width, height, noise):
     """Small pictures are enlarged before they are searched, and their noise with them."""
     rng = np.random.default_rng(1)
