@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import distributed
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -351,6 +350,8 @@ def test_ctrl_c_ends_all_processes_in_one_line(started, tmp_path):
 
 
 def test_the_same_rows_from_dask_a_laboratory_and_a_seed_that_kills_its_workers(tmp_path, capsys):
+    import distributed  # not while tests are collected: it takes a second in each process
+
     arguments = ["tiny", "alone", *noted(tmp_path, "tiny"), "--set", "tiny.fatal=[1]", "--set", "alone.fatal=[2]"]
     assert main([*arguments, "--processes", "2", "--out", str(tmp_path / "dask")], KNOWN, tmp_path) == 1
     complaints = capsys.readouterr().err
