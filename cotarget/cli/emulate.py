@@ -24,7 +24,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_file(parser, "--rig", "rig.toml of the simulated rig (the default rig)")
     add_file(parser, "--write", "rig.toml to write, which connects to it", required=True)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
-    for name in ("head", "fixed", "zoom", "board", "control"):
+    parser.add_argument("--head", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
+    about = "axis or rtsp, and the port to listen at; or the port alone (axis, at any free port)"
+    parser.add_argument("--fixed", type=protocol_and_port, default=0, metavar="PROTOCOL[:PORT]", help=about)
+    for name in ("zoom", "board", "control"):
         parser.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
     parser.add_argument("--tcp", action="store_true", help="connect the head by TCP instead of a serial port")
     parser.add_argument("--user", default="", metavar="NAME", help="user name that the fixed camera asks for (none)")
@@ -33,11 +36,21 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
 
 
+def protocol_and_port(text: str) -> tuple[str, int]:
+    """Parse the fixed camera's protocol, its port, or both."""
+    name, _, number = ("axis", "", text) if text.isdigit() else text.partition(":")
+    if name not in ("axis", "rtsp"):
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a port nor axis or rtsp, such as rtsp:8554")
+    return name, port(number or "0")
+
+
 def epilog() -> str:
     """List the faults that can be switched on, for --help."""
-    from cotarget.emulators.emulation import FAULTS
+    from cotarget.emulators.emulation import FAULTS, FIXED
 
-    return "faults: " + ", ".join(f"{device}.{name}" for device, names in FAULTS.items() for name in names)
+    rtsp = ", ".join(f"fixed.{name}" for name in FIXED["rtsp"])
+    names = ", ".join(f"{device}.{name}" for device, names in FAULTS.items() for name in names)
+    return f"faults: {names}\nfaults with --fixed rtsp: {rtsp}"
 
 
 def run(options: argparse.Namespace) -> None:
@@ -46,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
     sys.setswitchinterval(SWITCH_S)
     from cotarget.backends import load_config
     from cotarget.config import RigConfig, SimConfig, read_tables
-    from cotarget.emulators.emulation import Emulation, Ports, copied_tables, parse_fault
+    from cotarget.emulators.emulation import Emulation, Ports, copied_tables, faults_of, parse_fault
     from cotarget.emulators.world import paced
     from cotarget.files import write_atomically
 
@@ -57,21 +70,22 @@ def run(options: argparse.Namespace) -> None:
     if options.rig is not None:
         beside = copied_tables(read_tables(options.rig), options.rig.parent)
     check_outputs([options.write], rig_files(options.rig, config))
+    protocol, fixed_port = options.fixed or ("axis", 0)
     for fault in options.fault:
         with naming("--fault"):
-            parse_fault(fault)
-    ports = Ports(options.host, options.head, options.fixed, options.zoom, options.board, options.control)
+            parse_fault(fault, faults_of(protocol))
+    ports = Ports(options.host, options.head, fixed_port, options.zoom, options.board, options.control)
     password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
     if options.user and not password:
         raise ConfigError("--user needs a password: put it into the environment variable COTARGET_PASSWORD")
-    with Emulation(paced(config), ports, user=options.user, password=password) as emulation:
+    with Emulation(paced(config), ports, user=options.user, password=password, fixed=protocol) as emulation:
         for fault in options.fault:
             emulation.switch(fault)
         with previous_kept(options.write):
             write_atomically(options.write, emulation.rig_toml(tcp=options.tcp, beside=beside).encode())
         print(
             f"head     {emulation.head.port} and {emulation.head.url}\n"
-            f"fixed    {emulation.fixed.url}/mjpg/video.mjpg\n"
+            f"fixed    {emulation.fixed.url}{'/mjpg/video.mjpg' if protocol == 'axis' else ''}\n"
             f"zoom     ptpip:{options.host}:{emulation.zoom.port}:{emulation.zoom.port}\n"
             f"board    socket://{options.host}:{emulation.board.port}\n"
             f"control  socket://{options.host}:{emulation.control.port}\n"

@@ -15,6 +15,7 @@ from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.ports import UnitPorts
 from cotarget.emulators.ptu_d46.unit import UnitProfile
+from cotarget.emulators.rtsp import RTSP_FAULTS, EncodedStream, Encoder, RtspServer
 from cotarget.emulators.serve import LOCAL, Closes, Faults, JsonLines
 from cotarget.emulators.world import LiveWorld
 from cotarget.errors import ConfigError, choices
@@ -22,7 +23,10 @@ from cotarget.schema import Pose, model, validate
 
 PREVIEW_SHARE = 2  # the viewfinder's images are smaller than stills by this factor
 QUALITY = 90  # of JPEG, as the simulated cameras have by default
+ENCODING_S = 0.005  # to encode a picture of 640x480 and to decode it [s]
 PAN_SIGN = -1  # positive pan turns left, as in the D46's manual
+# Faults by the protocol of the fixed camera, the default first.
+FIXED: Mapping[str, tuple[str, ...]] = {"axis": AXIS_FAULTS, "rtsp": RTSP_FAULTS}
 FAULTS: Mapping[str, tuple[str, ...]] = {"head": D46_FAULTS, "fixed": AXIS_FAULTS, "zoom": S5IS_FAULTS}
 COPIED = ("board", "follow", "safety", "targets")  # tables of the simulated rig's file that hold for the emulated one
 
@@ -33,7 +37,7 @@ class Ports:
 
     host: str = LOCAL  # address of all servers
     head: int = 0  # TCP port of the head, beside its pseudo-terminal
-    fixed: int = 0  # HTTP port of the video server
+    fixed: int = 0  # port of the fixed camera
     zoom: int = 0  # PTP/IP port of the zoom camera
     board: int = 0  # port of the board's holder
     control: int = 0  # port for faults and ground truth
@@ -53,20 +57,25 @@ class Emulation(Closes):
     Args:
         config: of the simulated rig, in real time; see `cotarget.emulators.world.paced`.
         ports: where to listen.
-        user: user name of the video server; empty if everyone may connect.
+        user: user name of the fixed camera; empty if everyone may connect.
         password: of that user.
+        fixed: protocol of the fixed camera, of `FIXED`.
 
     Raises:
         ConfigError: these devices cannot have the simulated rig's sizes or steps.
         DeviceError: a port cannot be opened, or the machine cannot render.
     """
 
-    def __init__(self, config: RigConfig, ports: Ports = Ports(), *, user: str = "", password: str = "") -> None:
+    def __init__(
+        self, config: RigConfig, ports: Ports = Ports(), *, user: str = "", password: str = "", fixed: str = "axis"
+    ) -> None:
         sim = config.sim
         if sim.zoom.size[0] % PREVIEW_SHARE or sim.zoom.size[1] % PREVIEW_SHARE:
             raise ConfigError(f"sim.zoom.size: {list(sim.zoom.size)} cannot be halved for the viewfinder")
-        self.config, self._user = config, user
-        self.faults = {device: Faults(names) for device, names in FAULTS.items()}
+        if fixed == "rtsp" and any(side % 2 for side in sim.fixed.size):
+            raise ConfigError(f"sim.fixed.size: {list(sim.fixed.size)} is odd, and H.264 takes even sizes")
+        self.config, self._user, self._fixed = config, user, fixed
+        self.faults = {device: Faults(names) for device, names in faults_of(fixed).items()}
         head, (lowest, highest) = sim.head, sim.head.pan_deg
         unit = UnitProfile.from_degrees(
             (-highest, -lowest), head.tilt_deg, head.step_deg, head.speed_deg_s, head.accel_deg_s2
@@ -76,17 +85,7 @@ class Emulation(Closes):
             world = self.world = opened.enter_context(LiveWorld(config, pan_sign=PAN_SIGN))
             firmware = D46(world.pan, world.tilt, unit, self.faults["head"], world.clock.now)
             self.head = opened.enter_context(UnitPorts(firmware, tcp=ports.head, host=ports.host))
-            self.fixed = opened.enter_context(
-                AxisServer(
-                    {1: world.feeds["fixed"]},
-                    host=ports.host,
-                    port=ports.fixed,
-                    user=user,
-                    password=password,
-                    quality=QUALITY,
-                    faults=self.faults["fixed"],
-                )
-            )
+            self.fixed = self._open_fixed(opened, ports, password)
             self.zoom = opened.enter_context(
                 S5isServer(
                     world.feeds["zoom"],
@@ -102,6 +101,21 @@ class Emulation(Closes):
             self.board = opened.enter_context(JsonLines(self._present_board, ports.host, ports.board))
             self.control = opened.enter_context(JsonLines(self._control, ports.host, ports.control))
             self._opened = opened.pop_all()
+
+    def _open_fixed(self, opened: contextlib.ExitStack, ports: Ports, password: str) -> AxisServer | RtspServer:
+        """Serve the fixed camera by its protocol."""
+        feed, faults, user = self.world.feeds["fixed"], self.faults["fixed"], self._user
+        host, port = ports.host, ports.fixed
+        if self._fixed == "axis":
+            server = AxisServer(
+                {1: feed}, host=host, port=port, user=user, password=password, quality=QUALITY, faults=faults
+            )
+            return opened.enter_context(server)
+        stream = EncodedStream()
+        opened.enter_context(Encoder(feed, stream, self.config.sim.fixed.rate_hz, faults=faults))
+        return opened.enter_context(
+            RtspServer(stream, host=host, port=port, user=user, password=password, faults=faults)
+        )
 
     def rig_toml(self, *, tcp: bool = False, beside: Mapping[str, Any] | None = None) -> str:
         """Write the rig.toml that connects to this emulation.
@@ -124,14 +138,7 @@ class Emulation(Closes):
                 "speed_deg_s": sim.head.speed_deg_s,
                 "command_delay_s": delay,
             },
-            "fixed": {
-                "url": self.fixed.url,
-                "size": list(sim.fixed.size),
-                "resolution": "{}x{}".format(*sim.fixed.size),
-                "rate_hz": sim.fixed.rate_hz,
-                "latency_s": sim.fixed.latency_s if late else 0.0,
-            }
-            | ({"user": self._user} if self._user else {}),
+            "fixed": self._fixed_table(),
             "zoom": {
                 "port": f"ptpip:{self.zoom.host}:{self.zoom.port}:{self.zoom.port}",
                 "lens": [[0, sim.zoom.focal_mm[0]], [last, sim.zoom.focal_mm[1]]],
@@ -148,6 +155,18 @@ class Emulation(Closes):
         board = dataclasses.asdict(self.config.board)
         tables = {"backend": "hardware", "hardware": hardware, **(beside or {}), "board": board}
         return tomli_w.dumps({**tables, "targets": self._targets(tables.get("targets", {}))})
+
+    def _fixed_table(self) -> dict[str, Any]:
+        """Write the fixed camera's table of rig.toml."""
+        fixed = self.config.sim.fixed
+        latency_s = fixed.latency_s if self.config.sim.effects.latency else 0.0
+        if self._fixed == "rtsp":
+            # A parser gives a picture when the next one begins.
+            own = {"driver": "stream", "latency_s": latency_s + 1 / fixed.rate_hz + ENCODING_S}
+        else:
+            own = {"resolution": "{}x{}".format(*fixed.size), "latency_s": latency_s}
+        user = {"user": self._user} if self._user else {}
+        return {"url": self.fixed.url, "size": list(fixed.size), "rate_hz": fixed.rate_hz, **own, **user}
 
     def _targets(self, copied: Mapping[str, Any]) -> dict[str, Any]:
         """Scale the wanted sizes of targets to the viewfinder's smaller images."""
@@ -196,21 +215,30 @@ class Emulation(Closes):
         Raises:
             ConfigError: there is no such device or fault.
         """
-        device, name = parse_fault(fault)
+        device, name = parse_fault(fault, faults_of(self._fixed))
         self.faults[device].set(name, on)
 
 
-def parse_fault(fault: str) -> tuple[str, str]:
+def faults_of(fixed: str) -> dict[str, tuple[str, ...]]:
+    """List the faults of each device, where the fixed camera has a protocol of `FIXED`."""
+    return {**FAULTS, "fixed": FIXED[fixed]}
+
+
+def parse_fault(fault: str, known: Mapping[str, tuple[str, ...]] = FAULTS) -> tuple[str, str]:
     """Split a fault's full name, device.fault, into device and name.
+
+    Args:
+        fault: the full name.
+        known: faults of each device.
 
     Raises:
         ConfigError: there is no such device or fault.
     """
     device, _, name = fault.partition(".")
-    if device not in FAULTS:
-        raise ConfigError(f"unknown fault '{fault}'; they begin with: {choices(f'{d}.' for d in FAULTS)}")
-    if name not in FAULTS[device]:
-        raise ConfigError(f"unknown fault '{fault}'; those of {device} are: {choices(FAULTS[device])}")
+    if device not in known:
+        raise ConfigError(f"unknown fault '{fault}'; they begin with: {choices(f'{d}.' for d in known)}")
+    if name not in known[device]:
+        raise ConfigError(f"unknown fault '{fault}'; those of {device} are: {choices(known[device])}")
     return device, name
 
 
