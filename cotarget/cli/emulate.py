@@ -26,7 +26,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
     for name in ("head", "fixed", "zoom", "board", "control"):
         parser.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
-    parser.add_argument("--tcp", action="store_true", help="connect the head by TCP instead of a serial port")
+    about = "emulate head and zoom camera as one dome that is moved by this protocol (a PTU-D46 and a PowerShot)"
+    parser.add_argument("--ptz", choices=("visca",), help=about)
+    about = "units of the dome (ptzoptics)"
+    parser.add_argument("--units", choices=("ptzoptics", "evi_d70", "evi_d80"), default="ptzoptics", help=about)
+    about = "connect the head by TCP instead of a serial port, or the dome instead of by UDP"
+    parser.add_argument("--tcp", action="store_true", help=about)
     parser.add_argument("--user", default="", metavar="NAME", help="user name that the fixed camera asks for (none)")
     about = "fault to be on from the start, one of those below; the control socket switches faults later"
     parser.add_argument("--fault", action="append", default=[], metavar="DEVICE.FAULT", help=about)
@@ -64,17 +69,15 @@ def run(options: argparse.Namespace) -> None:
     password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
     if options.user and not password:
         raise ConfigError("--user needs a password: put it into the environment variable COTARGET_PASSWORD")
-    with Emulation(paced(config), ports, user=options.user, password=password) as emulation:
+    dome = {"dome": options.ptz, "units": options.units} if options.ptz else {}
+    with Emulation(paced(config), ports, user=options.user, password=password, **dome) as emulation:
         for fault in options.fault:
             emulation.switch(fault)
         with previous_kept(options.write):
             write_atomically(options.write, emulation.rig_toml(tcp=options.tcp, beside=beside).encode())
+        for name, address in emulation.addresses.items():
+            print(f"{name:<8} {address}")
         print(
-            f"head     {emulation.head.port} and {emulation.head.url}\n"
-            f"fixed    {emulation.fixed.url}/mjpg/video.mjpg\n"
-            f"zoom     ptpip:{options.host}:{emulation.zoom.port}:{emulation.zoom.port}\n"
-            f"board    socket://{options.host}:{emulation.board.port}\n"
-            f"control  socket://{options.host}:{emulation.control.port}\n"
             f"targets  {', '.join(config.sim.targets) or NO_TARGET}\n"
             f"{options.write} connects to them; Ctrl-C ends them",
             flush=True,

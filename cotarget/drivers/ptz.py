@@ -17,8 +17,7 @@ units, ranges, steps and speeds of pan, tilt and zoom, in the device's own numbe
 import contextlib
 import itertools
 import math
-from collections.abc import Callable
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Interval, Lt
@@ -194,7 +193,7 @@ class Dome:
     """
 
     Settings: ClassVar[type[PtzSettings]]
-    Link: ClassVar[Callable[[PtzSettings, Clock], PtzLink]]
+    Link: ClassVar[type[Any]]  # a PtzLink, made of settings and clock
 
     @classmethod
     def probe(cls, settings: PtzSettings) -> str:
