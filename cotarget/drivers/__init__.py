@@ -9,5 +9,5 @@ DRIVERS: Mapping[str, Mapping[str, str]] = {
     "fixed": {"axis": "cotarget.drivers.axis:AxisCamera", "stream": "cotarget.drivers.stream:StreamCamera"},
     "zoom": {"gphoto2": "cotarget.drivers.gphoto_camera:GphotoCamera"},
     "head": {"ptu_d46": "cotarget.drivers.ptu_d46:D46Head"},
-    "ptz": {"onvif": "cotarget.drivers.onvif:OnvifDome"},
+    "ptz": {"onvif": "cotarget.drivers.onvif:OnvifDome", "visca": "cotarget.drivers.visca:ViscaDome"},
 }

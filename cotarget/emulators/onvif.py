@@ -10,6 +10,7 @@ Sources: ONVIF Core, Media and PTZ Service Specifications; WS-Security UsernameT
 import base64
 import contextlib
 import hashlib
+import itertools
 import math
 import re
 import secrets
@@ -149,7 +150,7 @@ def lens_table(magnification: float) -> list[list[float]]:
 
 
 def _interpolated(x: float, knots: Sequence[tuple[float, float]]) -> float:
-    for (x0, y0), (x1, y1) in zip(knots, knots[1:], strict=False):
+    for (x0, y0), (x1, y1) in itertools.pairwise(knots):
         if x <= x1:
             return y0 + (y1 - y0) * (max(x, x0) - x0) / (x1 - x0)
     return knots[-1][1]
@@ -445,7 +446,8 @@ def _capabilities(camera: OnvifCamera, faults: Faults, message: Message) -> str:
 @answers("tds", "GetServices")
 def _services(camera: OnvifCamera, faults: Faults, message: Message) -> str:
     return "".join(
-        f"<tds:Service><tds:Namespace>{namespace}</tds:Namespace><tds:XAddr>{_address(message, faults, name)}</tds:XAddr>"
+        f"<tds:Service><tds:Namespace>{namespace}</tds:Namespace>"
+        f"<tds:XAddr>{_address(message, faults, name)}</tds:XAddr>"
         "<tds:Version><tt:Major>2</tt:Major><tt:Minor>60</tt:Minor></tds:Version></tds:Service>"
         for name, namespace in SERVICES.items()
         if not (name == "ptz" and "no-ptz" in faults)
