@@ -54,6 +54,7 @@ LOOK_S = 0.01  # period of looking for a halt during a command [s]
 STATUS_PAUSE_S = 0.03  # between the answer to a status and the next question [s]
 STATUS_TRIES = 3  # failed statuses in a row, after which the device has gone
 RETRY_S = 0.2  # pause after a failed status [s]
+RIGHTS = "moving takes the rights of an operator or administrator"
 STILL_S = 0.3  # whether a device says that it moves cannot be believed; it stands after so long in one place [s]
 ZOOM_S = 10.0  # slow lenses take this from end to end [s]
 ZOOM_STEPS = 1000  # in which the range of the zoom's number is divided
@@ -547,7 +548,8 @@ class OnvifLink(PtzLink):
             if len(errors) < len(orders):
                 return
             if self._clock.now() > deadline or not any(isinstance(error, SilentError) for error in errors):
-                raise DeviceError(f"{self.name} does not stop: {errors[0]}") from errors[0]
+                why = f"; {RIGHTS}" if isinstance(errors[0], LoginFaultError) else ""
+                raise DeviceError(f"{self.name} does not stop: {errors[0]}{why}") from errors[0]
 
     def _absolute(
         self, goals: Pair | None, zoom: float | None, speeds: tuple[float, ...] | None, requests: Requests
@@ -568,7 +570,7 @@ class OnvifLink(PtzLink):
                 if requests.halt_waits():
                     requests.proceed()
             except LoginFaultError as error:
-                raise RefusedError(f"{error}; moving takes the rights of an operator or administrator") from None
+                raise RefusedError(f"{error}; {RIGHTS}") from None
             except FaultError as error:
                 raise RefusedError(str(error)) from None
             else:

@@ -223,7 +223,8 @@ class SoapClient:
             found = device_time(root) or found
         except LoginFaultError:
             found = self._date
-        return 0.0 if found is None else (found - datetime.now(UTC)).total_seconds()
+        # Devices say whole seconds.
+        return 0.0 if found is None else (found - datetime.now(UTC)).total_seconds() + 0.5
 
     def _exchange(self, path: str, namespace: str, message: str, inner: str, deadline: float) -> Element:
         header = ""
