@@ -38,6 +38,7 @@ from cotarget.drivers.soap import (
     quote,
     text_at,
 )
+from cotarget.drivers.velocity import ReckonedAxis, SteeredAxis
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.rig import Clock
 from cotarget.schema import NotNegative, Positive, model
@@ -56,7 +57,10 @@ STATUS_TRIES = 3  # failed statuses in a row, after which the device has gone
 RETRY_S = 0.2  # pause after a failed status [s]
 RIGHTS = "moving takes the rights of an operator or administrator"
 STILL_S = 0.3  # whether a device says that it moves cannot be believed; it stands after so long in one place [s]
-ZOOM_S = 10.0  # slow lenses take this from end to end [s]
+BLIND_S = 0.5  # positions are reckoned where the device has said none for so long [s]
+LATEST_S = 0.02  # a status that takes longer is of its end [s]
+TIMEOUT_S = 1.0  # a continuous move ends by itself after so long, where the device can that [s]
+FINE = 0.02  # velocities are sent again where they change by more, as a share of the highest
 ZOOM_STEPS = 1000  # in which the range of the zoom's number is divided
 ZOOM_SLACK = 0.01  # of that range, by which the reported number may be off
 
@@ -73,12 +77,16 @@ class OnvifSettings(PtzSettings):
         tilt_deg: tilt at the ends of the device's coordinates, with positive tilt up [degrees].
         speed_deg_s: speed of moves; the device turns so at its full speed [degrees/s].
         slack_deg: largest distance of the reported position from the goal where it has arrived [degrees].
+        status_delay_s: by how much the positions that it reports are late, as measured [s].
+        zoom_s: time that the lens takes from end to end [s].
         all_axes: whether each move names pan, tilt and zoom; for a device that takes a missing one as 0.
     """
 
     url: str = ""
     profile: str = ""
     slack_deg: NotNegative = 0.1
+    status_delay_s: NotNegative = 0.0
+    zoom_s: Positive = 10.0
     speed_deg_s: Positive = 100.0
     all_axes: bool = False
 
@@ -136,16 +144,21 @@ def abilities_of(root: Element) -> Abilities:
     options = find(root, "Body/GetConfigurationOptionsResponse/PTZConfigurationOptions")
     spaces: dict[str, tuple[Space, ...]] = {}
     for each in find(options, "Spaces") or ():
-        ranges = tuple(
-            Range(low, high)
-            for axis in ("XRange", "YRange")
-            if (low := number_at(each, f"{axis}/Min")) is not None
-            and (high := number_at(each, f"{axis}/Max")) is not None
-        )
         name = each.tag.rpartition("}")[2]
-        spaces[name] = (*spaces.get(name, ()), Space(text_at(each, "URI"), ranges))
+        spaces[name] = (*spaces.get(name, ()), space_of(each))
     shortest, longest = (seconds(text_at(options, f"PTZTimeout/{name}")) for name in ("Min", "Max"))
     return Abilities(spaces, Range(shortest, longest))
+
+
+def space_of(element: Element) -> Space:
+    """Read a coordinate system."""
+    ranges = tuple(
+        Range(low, high)
+        for axis in ("XRange", "YRange")
+        if (low := number_at(element, f"{axis}/Min")) is not None
+        and (high := number_at(element, f"{axis}/Max")) is not None
+    )
+    return Space(text_at(element, "URI"), ranges)
 
 
 def number_at(element: Element | None, path: str) -> float | None:
@@ -223,6 +236,7 @@ class OnvifDevice:
         name: of the device in messages.
         model: maker, model and firmware.
         url: address of its stream.
+        configuration: the PTZ configuration of its profile.
         abilities: how it can be moved.
 
     Raises:
@@ -242,8 +256,8 @@ class OnvifDevice:
             names = (text_at(said, name) for name in ("Manufacturer", "Model", "FirmwareVersion"))
             self.model = quote(" ".join(filter(None, names))) or "a device"
             media, self._ptz = self._services()
-            self.profile, configuration = self._find_profile(media)
-            token = f"<ConfigurationToken>{configuration}</ConfigurationToken>"
+            self.profile, self.configuration = self._find_profile(media)
+            token = f"<ConfigurationToken>{self.configuration.get('token', '')}</ConfigurationToken>"
             self.abilities = abilities_of(self._ask(self._ptz, PTZ, "GetConfigurationOptions", token))
             self.url = self._stream_address(media)
             opened.pop_all()
@@ -252,7 +266,8 @@ class OnvifDevice:
         """Ask for the positions."""
         begin = self._clock.now()
         root = self._ask(self._ptz, PTZ, "GetStatus", self._token, STATUS_S)
-        return status_of(root, (begin + self._clock.now()) / 2)
+        now = self._clock.now()
+        return status_of(root, now - min((now - begin) / 2, LATEST_S) - self._settings.status_delay_s)
 
     def command(self, message: str, inner: str, timeout: float = COMMAND_S) -> None:
         """Send a command; raises as `SoapClient.call` does."""
@@ -307,11 +322,11 @@ class OnvifDevice:
         # Behind a router or a proxy a device gives an address that leads nowhere from here.
         return urlsplit(media).path or DEVICE_PATH, urlsplit(ptz).path or DEVICE_PATH
 
-    def _find_profile(self, media: str) -> tuple[str, str]:
-        """Return the tokens of the media profile and of its PTZ configuration."""
+    def _find_profile(self, media: str) -> tuple[str, Element]:
+        """Return the token of the media profile, and its PTZ configuration."""
         profiles = find_all(self._ask(media, MEDIA, "GetProfiles"), "Body/GetProfilesResponse/Profiles")
         moving = {
-            profile.get("token", ""): configuration.get("token", "")
+            profile.get("token", ""): configuration
             for profile in profiles
             if (configuration := find(profile, "PTZConfiguration")) is not None
         }
@@ -391,6 +406,9 @@ class StatusReader:
 class OnvifLink(PtzLink):
     """The protocol of a camera that ONVIF moves; the camera was only asked.
 
+    Pan and tilt go to positions by absolute moves, or are steered there by velocities where the device has no absolute
+    moves. Positions that the device does not say are reckoned from the commands.
+
     Raises:
         ConfigError: it has no such profile.
         DeviceError: there is no such camera, it refuses the user, or it cannot be moved to positions.
@@ -402,20 +420,19 @@ class OnvifLink(PtzLink):
         self._settings, self._clock = settings, clock
         self._device = device = OnvifDevice(settings, clock)
         self.name, self.url = device.name, device.url
+        self._who = f"{self.name} ({device.model})"
         with contextlib.ExitStack() as opened:
             opened.callback(device.soap.close)
-            self._say_how(device.abilities)
             status = device.status()
+            self._is_steered = self._refuse_unable(status)
             self._coordinates = self._find_coordinates(status)
             self.axes = self._find_axes()
-            off = device.soap.clock_off_s
-            clock_said = f", its clock {off:+.0f} s off" if abs(off) > 1.0 else ""
-            pan, tilt, zoom = self._positions(status)
-            self.identity = (
-                f"{device.model} at {self.name.removeprefix('the device at ')}, profile {quote(device.profile)}"
-                f"{clock_said}, pan {pan:.1f}, tilt {tilt:.1f} degrees, zoom {zoom:g}"
-            )
-            self._goals: tuple[float | None, float | None, float | None] = (pan, tilt, zoom)
+            self._reckoned = [ReckonedAxis(facts, settings.command_delay_s) for facts in self.axes]
+            self._steered = [SteeredAxis(facts, settings.command_delay_s) for facts in self.axes[:2]]
+            self._renewed, self._timeout_s = -math.inf, self._find_timeout()
+            self._seen, self._heard = status, clock.now()
+            self.identity = self._describe(status)
+            self._goals: tuple[float | None, float | None, float | None] = self._positions(status)
             self._workers = ThreadPoolExecutor(4, "onvif command")
             self._sent = Future[None]()  # of the newest command
             self._sent.set_result(None)
@@ -423,18 +440,33 @@ class OnvifLink(PtzLink):
             opened.pop_all()
 
     def poll(self, requests: Requests) -> Sequence[Poll]:
-        """Take the newest positions."""
-        status = self._reader.take()
-        if status is None:
+        """Take the newest positions, and reckon those that the device does not say; steer an axis on its way."""
+        status, now = self._reader.take(), self._clock.now()
+        if status is not None:
+            self._heard, self._seen = now, status
+            polls = self._polls(status, now)
+            if self._is_steered:
+                self._steer(requests)
+            return polls
+        if now - self._heard < BLIND_S:
             return []
-        return [Poll(axis, position, status.t) for axis, position in enumerate(self._positions(status))]
+        if self._is_steered and any(axis.velocity for axis in self._steered):
+            self._stop(now + STOP_S)
+        return self._polls(Status(None, None, None, now), now)
 
     def move(self, goals: Pair, speeds: Pair, requests: Requests) -> None:
-        """Send pan and tilt to positions by an absolute move."""
-        self._goals = (*goals, self._goals[2])
+        """Send pan and tilt to positions by an absolute move, or begin to steer them there."""
+        self._goals, now = (*goals, self._goals[2]), self._clock.now()
+        if self._is_steered:
+            for axis, goal, speed in zip(self._steered, goals, speeds, strict=True):
+                axis.aim(goal, speed, now)
+            self._steer(requests)
+            return
         zoom = self._goals[2] if self._settings.all_axes else None
         fastest = self._settings.speed_deg_s
         self._absolute(goals, zoom, tuple(min(speed / fastest, 1.0) for speed in speeds), requests)
+        for reckoned, goal, speed in zip(self._reckoned[:2], goals, speeds, strict=True):
+            reckoned.command(goal, speed, now)
 
     def zoom(self, position: float, requests: Requests) -> None:
         """Send the lens to a position."""
@@ -442,6 +474,7 @@ class OnvifLink(PtzLink):
         pan, tilt, _ = self._goals
         both = (pan, tilt) if self._settings.all_axes and pan is not None and tilt is not None else None
         self._absolute(both, position, None, requests)
+        self._reckoned[2].command(position, self.axes[2].fastest, self._clock.now())
 
     def halt(self, patience: float) -> None:
         """Stop pan and tilt; once more when a command that was given up is answered, since it may move them later."""
@@ -458,31 +491,38 @@ class OnvifLink(PtzLink):
         self._workers.shutdown(wait=False)
         self._device.soap.close()
 
-    # Parts
+    # What the device is
 
-    def _say_how(self, abilities: Abilities) -> None:
-        """Refuse a device that cannot be sent to positions, and say what it can."""
-        who = f"{self.name} ({self._device.model})"
-        if not abilities.space("AbsolutePanTiltPositionSpace"):
-            ways = {"velocities": "ContinuousPanTiltVelocitySpace", "steps": "RelativePanTiltTranslationSpace"}
-            can = [word for word, name in ways.items() if abilities.space(name)]
-            by = f"can only be moved by {' and '.join(can)}" if can else "can only be sent to its presets"
-            raise DeviceError(f"{who} {by}, and not to positions: it is not driven")
-        if not abilities.space("AbsoluteZoomPositionSpace"):
+    def _refuse_unable(self, status: Status) -> bool:
+        """Refuse a device that can be neither sent nor steered to positions; return whether it has to be steered."""
+        abilities, who = self._device.abilities, self._who
+        if not abilities.space("AbsoluteZoomPositionSpace") and abilities.spaces:
             raise DeviceError(f"{who} has no zoom that goes to positions: it is not driven")
+        if abilities.space("AbsolutePanTiltPositionSpace"):
+            return False
+        if not abilities.space("ContinuousPanTiltVelocitySpace"):
+            by = "steps" if abilities.space("RelativePanTiltTranslationSpace") else "presets"
+            raise DeviceError(f"{who} has neither absolute moves nor velocities, only {by}: it is not driven")
+        if status.pan is None or status.tilt is None:
+            raise DeviceError(f"{who} can only be moved by velocities, and does not say where it is: it is not driven")
+        return True
+
+    def _find_timeout(self) -> float | None:
+        """Return the timeout of continuous moves [s]; None where the device has none of its own choice."""
+        shortest, longest = self._device.abilities.timeout_s
+        return min(max(TIMEOUT_S, shortest), longest) if longest > 0 else None
 
     def _find_coordinates(self, status: Status) -> tuple[Coordinate, Coordinate, Coordinate]:
         """Find the coordinate systems of the moves, which have to be those of the status."""
         settings, abilities = self._settings, self._device.abilities
-        turned = abilities.space("AbsolutePanTiltPositionSpace", status.space)
+        turned = abilities.space("AbsolutePanTiltPositionSpace", status.space) or self._limits_space()
         zoomed = abilities.space("AbsoluteZoomPositionSpace")
-        assert turned is not None
         assert zoomed is not None
         ranges = (*(*turned.ranges, NOTHING, NOTHING)[:2], (*zoomed.ranges, NOTHING)[0])
         for word, given in zip(("pan", "tilt", "zoom"), ranges, strict=True):
             if not given.lowest < given.highest:
                 raise DeviceError(
-                    f"{self.name} says that {word} goes from {given.lowest:g} to {given.highest:g}: it has no such axis"
+                    f"{self._who} says that {word} goes from {given.lowest:g} to {given.highest:g}: it is not driven"
                 )
         self._uris = (turned.uri, zoomed.uri)
         own_degrees = turned.uri.endswith("SphericalPositionSpaceDegrees")
@@ -492,6 +532,11 @@ class OnvifLink(PtzLink):
             ends = Range(*sorted(sign * end for end in degrees))
             found.append(Coordinate(numbers, numbers if own_degrees else ends))
         return found[0], found[1], Coordinate(ranges[2], ranges[2])
+
+    def _limits_space(self) -> Space:
+        """Return the coordinates of the status of a device without absolute moves: those of its limits."""
+        space = find(self._device.configuration, "PanTiltLimits/Range")
+        return Space("", ()) if space is None else space_of(space)
 
     def _find_axes(self) -> tuple[AxisFacts, AxisFacts, AxisFacts]:
         settings = self._settings
@@ -514,7 +559,7 @@ class OnvifLink(PtzLink):
             unit=1.0,
             lowest=lowest,
             highest=highest,
-            fastest=width / ZOOM_S,
+            fastest=width / settings.zoom_s,
             step=width / ZOOM_STEPS,
             slack=ZOOM_SLACK * width,
             still_s=STILL_S,
@@ -522,19 +567,72 @@ class OnvifLink(PtzLink):
         )
         return pan, tilt, lens
 
-    def _positions(self, status: Status) -> tuple[float, float, float]:
-        """Convert positions to degrees in the device's sense, and to the zoom's number.
+    def _describe(self, status: Status) -> str:
+        """Describe the device in one line."""
+        positions = zip(("pan", "tilt", "zoom"), self._positions(status), ("degrees", "degrees", ""), strict=True)
+        where = [
+            f"{word} {at:.1f} {unit}" if unit else f"{word} {at:g}" for word, at, unit in positions if at is not None
+        ]
+        missing = [word for word, number in zip(("pan", "tilt", "zoom"), status[:3], strict=True) if number is None]
+        if missing:
+            where.append(f"no position of {' and '.join(missing)}, which is reckoned from the commands")
+        off = self._device.soap.clock_off_s
+        clock = [f"its clock {off:+.0f} s off"] if abs(off) > 1.0 else []
+        way = ["steered by velocities"] if self._is_steered else []
+        address = self.name.removeprefix("the device at ")
+        parts = [f"{self._device.model} at {address}", f"profile {quote(self._device.profile)}", *clock, *way, *where]
+        return ", ".join(parts)
 
-        Raises:
-            DeviceError: the device does not say one of them.
-        """
-        named = zip(("pan", "tilt", "zoom"), status[:3], self._coordinates, strict=True)
-        found = []
-        for word, number, coordinate in named:
-            if number is None:
-                raise DeviceError(f"{self.name} ({self._device.model}) reports no position of {word}: it is not driven")
-            found.append(coordinate.to_degrees(number))
-        return found[0], found[1], found[2]
+    def _positions(self, status: Status) -> tuple[float | None, float | None, float | None]:
+        """Convert positions to degrees in the device's sense, and to the zoom's number; None where there are none."""
+        pan, tilt, zoom = (
+            None if number is None else coordinate.to_degrees(number)
+            for number, coordinate in zip(status[:3], self._coordinates, strict=True)
+        )
+        return pan, tilt, zoom
+
+    def _polls(self, status: Status, now: float) -> list[Poll]:
+        """Make polls of the positions that were said, and of those that are reckoned."""
+        polls = []
+        for i, (position, reckoned) in enumerate(zip(self._positions(status), self._reckoned, strict=True)):
+            if position is None:
+                here, sigma = reckoned.at(now)
+                polls.append(Poll(i, here, now, sigma=sigma))
+            else:
+                reckoned.correct(position, status.t)
+                polls.append(Poll(i, position, status.t))
+        return polls
+
+    # Commands
+
+    def _steer(self, requests: Requests) -> None:
+        """Send the velocities that lead to the goals, where they change, or before the device ends them by itself."""
+        now = self._clock.now()
+        pan, tilt, _ = self._positions(self._seen)
+        assert pan is not None
+        assert tilt is not None
+        wanted = [axis.wanted(at, self._seen.t, now) for axis, at in zip(self._steered, (pan, tilt), strict=True)]
+        fastest = self._settings.speed_deg_s
+        same = all(
+            abs(speed - axis.velocity) <= FINE * fastest and (speed == 0) == (axis.velocity == 0)
+            for speed, axis in zip(wanted, self._steered, strict=True)
+        )
+        due = any(wanted) and now - self._renewed > (self._timeout_s or TIMEOUT_S) / 2
+        if same and not due:
+            return
+        zoom = 0.0 if self._settings.all_axes else None
+        velocity = f"<Velocity>{vector(wanted[0] / fastest, wanted[1] / fastest, zoom)}</Velocity>"
+        timeout = f"<Timeout>PT{self._timeout_s:g}S</Timeout>" if self._timeout_s else ""
+        try:
+            self._send("ContinuousMove", velocity + timeout, requests)
+        except RefusedError:
+            if not timeout:
+                raise
+            self._timeout_s = None  # some refuse a timeout though they say its range
+            self._send("ContinuousMove", velocity, requests)
+        self._renewed = now
+        for axis, speed in zip(self._steered, wanted, strict=True):
+            axis.send(speed, now)
 
     def _stop(self, deadline: float) -> None:
         """Stop by a stop and by velocities of zero, since devices may ignore one; repeat both until one is answered."""
@@ -546,6 +644,11 @@ class OnvifLink(PtzLink):
             answers = [self._workers.submit(self._device.command, *order, STOP_S) for order in orders]
             errors = [error for answer in answers if (error := answer.exception()) is not None]
             if len(errors) < len(orders):
+                now = self._clock.now()
+                for steered in self._steered:
+                    steered.stop(now)
+                for reckoned in self._reckoned[:2]:
+                    reckoned.halt(now)
                 return
             if self._clock.now() > deadline or not any(isinstance(error, SilentError) for error in errors):
                 why = f"; {RIGHTS}" if isinstance(errors[0], LoginFaultError) else ""

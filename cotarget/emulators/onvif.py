@@ -32,8 +32,8 @@ from cotarget.emulators.serve import LOCAL, Faults, TcpServer
 ONVIF_PROFILES = (
     # Moves
     "absolute-ignored",  # an absolute move is answered, and nothing moves
-    "no-absolute",  # neither absolute moves nor their coordinates
-    "continuous-only",
+    "no-absolute",  # pan and tilt have no absolute moves
+    "continuous-only",  # pan and tilt have velocities alone
     "presets-only",
     "slow-stop",  # after a stop it turns on for 0.4 s
     "slower-stop",  # for 1.1 s
@@ -467,9 +467,8 @@ def _spaces(camera: OnvifCamera, faults: Faults) -> str:
     if "presets-only" in faults:
         return ""
     unit, share = (-1.0, 1.0), (0.0, 1.0)
-    absolute = _space("AbsolutePanTiltPositionSpace", camera.space, *camera.numbers()) + _space(
-        "AbsoluteZoomPositionSpace", f"{ZOOM}/PositionGenericSpace", camera.zoom_numbers()
-    )
+    absolute = _space("AbsolutePanTiltPositionSpace", camera.space, *camera.numbers())
+    zoom = _space("AbsoluteZoomPositionSpace", f"{ZOOM}/PositionGenericSpace", camera.zoom_numbers())
     relative = _space("RelativePanTiltTranslationSpace", f"{PAN_TILT}/TranslationGenericSpace", unit, unit)
     if "no-absolute" in faults or "continuous-only" in faults:
         absolute = ""
@@ -477,6 +476,7 @@ def _spaces(camera: OnvifCamera, faults: Faults) -> str:
         relative = ""
     return (
         absolute
+        + zoom
         + relative
         + _space("ContinuousPanTiltVelocitySpace", f"{PAN_TILT}/VelocityGenericSpace", unit, unit)
         + _space("ContinuousZoomVelocitySpace", f"{ZOOM}/VelocityGenericSpace", unit)
@@ -588,8 +588,8 @@ def _refuse_unable(message: Message, faults: Faults, *without: str) -> None:
 
 @answers("tptz", "AbsoluteMove")
 def _absolute(camera: OnvifCamera, faults: Faults, message: Message) -> str:
-    _refuse_unable(message, faults, "no-absolute", "continuous-only", "presets-only")
     pan, tilt, zoom = message.vector("Position")
+    _refuse_unable(message, faults, "presets-only", *("no-absolute", "continuous-only") * (pan is not None))
     speed = message.vector("Speed")[:2]
     if "absolute-ignored" not in faults:
         speeds = None if speed[0] is None or speed[1] is None else (speed[0], speed[1])

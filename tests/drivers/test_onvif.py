@@ -170,15 +170,80 @@ def test_a_fault_in_mid_move_is_an_error_of_one_line(fault, monkeypatch):
         unit.faults.set(fault, False)
 
 
+# Devices that do not say where they are, or do not go where they are sent
+
+
+@pytest.mark.parametrize("profile", ["no-status", "zoom-status", "blocking-status"])
+def test_positions_that_are_not_said_are_reckoned(profile):
+    with OnvifUnit(profile) as unit, opened(unit, zoom_s=1.0) as dome:
+        assert (math.degrees(dome.head.state().sigma) > 50.0) == (profile != "blocking-status")
+        dome.head.move(math.radians(-20.0), math.radians(10.0), wait=True)
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((-20.0, 10.0), abs=NEAR_DEG)
+        state = dome.head.state()
+        assert (math.degrees(state.pan), math.degrees(state.tilt)) == pytest.approx((-20.0, 10.0), abs=NEAR_DEG)
+        assert state.sigma == 0.0
+        dome.head.move(math.radians(10.0), math.radians(10.0), speed=math.radians(20.0))
+        wait_for(lambda: unit.pan.degrees() > -5.0)
+        state = dome.head.state()
+        assert math.degrees(state.pan) == pytest.approx(unit.pan.degrees(), abs=15.0)
+        dome.zoom.zoom(dome.zoom.focal_range[1])
+        wait_for(lambda: not dome.zoom.state().moving)
+        assert dome.zoom.state().focal_px == pytest.approx(dome.zoom.focal_range[1], rel=0.02)
+
+
+@pytest.mark.parametrize("profiles", [
+    ("no-absolute",), ("continuous-only",), ("continuous-only", "timeout-fault"), ("continuous-only", "slow-stop"),
+    ("continuous-only", "stop-ignored"), ("continuous-only", "timeout-clamped"), ("continuous-only", "wide-ranges"),
+], ids=",".join)  # fmt: skip
+def test_a_device_that_takes_velocities_is_steered_to_its_goal(profiles):
+    with OnvifUnit(*profiles) as unit, opened(unit) as dome:
+        for pan, tilt in ((25.0, 10.0), (24.5, 10.0), (-30.0, 12.0)):
+            dome.head.move(math.radians(pan), math.radians(tilt), speed=math.radians(60.0), wait=True)
+            slack = unit.settings.slack_deg + NEAR_DEG
+            assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((pan, tilt), abs=slack)
+        assert "AbsoluteMove" not in unit.moves[1:]
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(40.0))
+        wait_for(lambda: unit.pan.degrees() > 0.0)
+        dome.head.halt()
+        time.sleep(SETTLED_S + 0.4)
+        assert not unit.turning()
+        assert unit.pan.degrees() < 80.0
+
+
+def test_a_steered_device_goes_on_beyond_its_default_timeout(monkeypatch):
+    """At 10 degrees/s, 15 degrees take longer than the timeout of one second."""
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        dome.head.move(math.radians(25.0), 0.0, speed=math.radians(10.0), wait=True)
+        assert unit.pan.degrees() == pytest.approx(25.0, abs=unit.settings.slack_deg + NEAR_DEG)
+
+
+def test_a_steered_device_stops_by_itself_where_the_program_dies(monkeypatch):
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(10.0))
+        wait_for(lambda: unit.turning())
+        monkeypatch.setattr(OnvifLink, "poll", lambda link, requests: [])  # as if it hung
+        wait_for(lambda: not unit.turning())
+        assert unit.pan.degrees() < 30.0
+
+
+def test_a_steered_head_follows_a_goal_that_moves():
+    """At 8 degrees/s and ten goals a second; without the goals' own speed it would lag by 2 degrees."""
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        begin, lags = time.monotonic(), []
+        while (passed := time.monotonic() - begin) < 4.0:
+            dome.head.move(math.radians(8.0 * passed), 0.0)
+            time.sleep(0.1)
+            lags.append(8.0 * (time.monotonic() - begin) - unit.pan.degrees())
+        assert abs(sorted(lags[20:])[len(lags[20:]) // 2]) < 1.5
+
+
 # What is wrong from the start
 
 
 @pytest.mark.parametrize(("profile", "said"), [
     ("no-ptz", r"has no pan-tilt-zoom service: it can be \[hardware.fixed\]"),
-    ("presets-only", "can only be sent to its presets, and not to positions"),
-    ("continuous-only", "can only be moved by velocities, and not to positions"),
-    ("no-absolute", "can only be moved by velocities and steps, and not to positions"),
-    ("no-status", "reports no position of pan"), ("zoom-status", "reports no position of pan"),
+    ("presets-only", "has neither absolute moves nor velocities, only presets: it is not driven"),
+    ("continuous-only,no-status", "can only be moved by velocities, and does not say where it is: it is not driven"),
     ("no-zoom", "says that zoom goes from 1 to 1"),
     ("unauthorized", "not for the user 'root': check hardware.ptz.user and the password"),
     ("silence", "did not answer GetSystemDateAndTime in time"), ("refuse", "broke off|cannot be reached"),
@@ -187,7 +252,7 @@ def test_a_fault_in_mid_move_is_an_error_of_one_line(fault, monkeypatch):
 ])  # fmt: skip
 def test_a_dome_that_cannot_be_driven_is_named_in_one_line(profile, said, monkeypatch):
     monkeypatch.setattr(onvif, "ASK_S", 2.0)
-    with OnvifUnit(profile) as unit:
+    with OnvifUnit(*profile.split(",")) as unit:
         assert re.search(said, refused(unit))
 
 
