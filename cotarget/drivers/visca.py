@@ -106,7 +106,7 @@ class ViscaSettings(PtzSettings):
             )
         )
         lens = AxisFacts(
-            unit=1.0, lowest=0, highest=OPTICAL, fastest=OPTICAL / ZOOM_S, step=1.0, slack=8, loses_steps=False
+            unit=1.0, lowest=0, highest=OPTICAL, fastest=OPTICAL / ZOOM_S, step=1.0, slack=32, loses_steps=False
         )
         return pan, tilt, lens
 

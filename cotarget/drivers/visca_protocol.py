@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from cotarget.drivers.link_errors import LostError, RefusedError, ReplyError, SilentError
-from cotarget.errors import DeviceError
+from cotarget.errors import ConfigError, DeviceError
 from cotarget.rig import Clock
 
 # Messages
@@ -168,6 +168,7 @@ CONNECT_S, GREETINGS = 1.0, 2  # for a TCP connection [s]; inquiries to each tra
 SLICE_S = 0.01  # [s]
 RECEIVE = 4096  # bytes
 LONGEST = 64  # bytes of a stream without an end of a message
+MOST_DROPPED = 1000  # packets of a flood that are dropped at once
 SHOWN = 24  # bytes of a wrong answer in an error
 
 
@@ -433,9 +434,8 @@ class Line:
                 self._inbox.append(packet)
             return
         if not data and self.transport.kind == socket.SOCK_STREAM:
-            raise LostError(
-                self.name, ConnectionResetError(errno.ECONNRESET, "it closes the connection, as to a second program")
-            )
+            closed = ConnectionResetError(errno.ECONNRESET, "it closes the connection, as to a second program")
+            raise LostError(self.name, closed) from closed
         *messages, rest = (self._stream + data).split(bytes([END]))
         self._stream = rest[-LONGEST:] if self.transport.kind == socket.SOCK_STREAM else b""
         for message in messages:
@@ -446,11 +446,13 @@ class Line:
         self.heard = rest or self.heard
 
     def _drain(self, quiet_s: float) -> int:
-        """Drop what has come, until nothing comes for a time [s]; return the number of answers to inquiries in it."""
-        for _ in range(TRIES):
-            if not self._readable(quiet_s):
+        """Drop what comes within a time [s]; return the number of answers to inquiries in it."""
+        end = self._clock.now() + quiet_s
+        for _ in range(MOST_DROPPED):
+            if self._readable(min(max(end - self._clock.now(), 0.0), SLICE_S)):
+                self._read()
+            elif self._clock.now() >= end or self.hurry():
                 break
-            self._read()
         dropped = [parse(packet.payload) for packet in self._inbox]
         self._inbox.clear()
         return sum(answer is not None and answer.kind == 5 and bool(answer.data) for answer in dropped)
@@ -488,34 +490,40 @@ def open_line(host: str, port: int, names: Sequence[str], clock: Clock) -> tuple
         clock: the rig's clock.
 
     Raises:
+        ConfigError: the address is not known.
         DeviceError: none of them answers; the message says what was tried, and what may help.
     """
     tried = []
     for transport in (TRANSPORTS[name] for name in names):
         words = transport.words.format(port or transport.port)
-        connection: socket.socket | None = None
-        try:
-            connection = _connect(host, port or transport.port, transport)
-            line = Line(connection, transport, f"{host} ({words})", clock)
-            version = line.greet()
-            connection = None
-            return line, version
-        except socket.gaierror as error:
-            raise DeviceError(
-                f"hardware.ptz.host: '{host}' is no address that is known here ({error.strerror})"
-            ) from None
-        except SilentError:
-            tried.append(f"{words}: {_what_came(line)}")
-        except (LostError, OSError) as error:
-            cause = error.__cause__ if isinstance(error, LostError) else error
-            tried.append(f"{words}: {getattr(cause, 'strerror', None) or cause}")
-        finally:
-            if connection is not None:
-                connection.close()
+        found = _greeted(host, port or transport.port, transport, f"{host} ({words})", clock)
+        if not isinstance(found, str):
+            return found
+        tried.append(f"{words}: {found}")
     raise DeviceError(
         f"no camera at {host} answers VISCA ({'; '.join(tried)}): check host and the camera's power, switch VISCA over "
         "IP on in its network settings, and set port if it has another one there"
     )
+
+
+def _greeted(host: str, port: int, transport: Transport, name: str, clock: Clock) -> tuple[Line, bytes] | str:
+    """Connect and greet; return the line and the answer to `VERSION`, or why that failed."""
+    why, line = "no answer", None
+    try:
+        line = Line(_connect(host, port, transport), transport, name, clock)
+        return line, line.greet()
+    except (socket.gaierror, UnicodeError):
+        raise ConfigError(f"hardware.ptz.host: '{host}' is no address that is known here") from None
+    except SilentError:
+        pass
+    except (LostError, OSError) as error:
+        cause = error.__cause__ if isinstance(error, LostError) else error
+        why = getattr(cause, "strerror", None) or str(cause)
+    if line is not None:
+        line.close()
+        if line.heard:
+            why = f"answers {ascii(line.heard[:SHOWN])[1:]}, which is no VISCA"
+    return why
 
 
 def _connect(host: str, port: int, transport: Transport) -> socket.socket:
@@ -530,7 +538,3 @@ def _connect(host: str, port: int, transport: Transport) -> socket.socket:
         connection.close()
         raise
     return connection
-
-
-def _what_came(line: Line) -> str:
-    return f"answers {ascii(line.heard[:SHOWN])[1:]}, which is no VISCA" if line.heard else "no answer"
