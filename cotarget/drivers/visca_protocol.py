@@ -32,7 +32,7 @@ ZOOM = bytes.fromhex("81 09 04 47 FF")
 # A valid speed must be given even here.
 STOP = bytes.fromhex("81 01 06 01 01 01 03 03 FF")
 DIGITAL_ZOOM_OFF = bytes.fromhex("81 01 04 06 03 FF")
-CANCELS = (bytes.fromhex("81 21 FF"), bytes.fromhex("81 22 FF"))  # the commands in socket 1 and 2
+SOCKETS = (1, 2)  # of a camera, each for a command under way
 STANDBY = 3  # answer to POWER
 SYNTAX, BUFFER_FULL, CANCELLED, NO_SOCKET, NOT_EXECUTABLE = 0x02, 0x03, 0x04, 0x05, 0x41
 ERRORS = {
@@ -168,6 +168,7 @@ CONNECT_S, GREETINGS = 1.0, 2  # for a TCP connection [s]; inquiries to each tra
 SLICE_S = 0.01  # [s]
 RECEIVE = 4096  # bytes
 LONGEST = 64  # bytes of a stream without an end of a message
+FLOOD_S = 0.2  # beyond a deadline, after which not even what has come is read: it may never end [s]
 MOST_DROPPED = 1000  # packets of a flood that are dropped at once
 SHOWN = 24  # bytes of a wrong answer in an error
 
@@ -253,8 +254,8 @@ class Line:
                 break
         raise self._silent()
 
-    def order(self, command: bytes, patience: float = TRIES * ANSWER_S, again_s: float = ANSWER_S) -> None:
-        """Send an order until it is acknowledged, each time with the same number.
+    def order(self, command: bytes, patience: float = TRIES * ANSWER_S, again_s: float = ANSWER_S) -> int:
+        """Send an order until it is acknowledged, each time with the same number; return the socket, 0 if unknown.
 
         Args:
             command: the order.
@@ -272,7 +273,7 @@ class Line:
             while (packet := self._receive(min(now + again_s, max(end, now + SLICE_S)))) is not None:
                 if self._is_abnormal(packet):
                     if repeated:  # it has the order, and its acknowledgement was lost
-                        return
+                        return 0
                     self._reset()
                     count = self._next()
                     break
@@ -284,7 +285,7 @@ class Line:
                 # A completion may be of an earlier order, unless its number says otherwise.
                 if answer.kind == 4 or (not answer.data and (packet.number == count or not answer.socket)):
                     self._answered = count
-                    return
+                    return answer.socket
             else:
                 repeated = True
             if self._clock.now() >= end:
@@ -292,12 +293,13 @@ class Line:
             if repeated and self.hurry() and command != STOP:
                 raise self._silent()
 
-    def patiently(self, command: bytes, proceed: Callable[[], None]) -> None:
-        """Send an order; send it again for `BUSY_S` where the camera refuses it for now.
+    def patiently(self, command: bytes, proceed: Callable[[], None], before: int = 0) -> int:
+        """Send an order; send it again for `BUSY_S` where the camera refuses it for now. Returns as `order` does.
 
         Args:
             command: the order.
             proceed: called before each repetition; raises where the order is not wanted any more.
+            before: socket of the order that this one replaces; it is cancelled where none is free.
 
         Raises:
             RefusedError: the camera refuses the order.
@@ -305,13 +307,13 @@ class Line:
         end = self._clock.now() + BUSY_S
         while True:
             try:
-                self.order(command)
-                return
+                return self.order(command)
             except CodedError as error:
                 if error.code not in (BUFFER_FULL, NOT_EXECUTABLE) or self._clock.now() >= end:
                     raise
                 if error.code == BUFFER_FULL:
-                    self.cancel()
+                    self.cancel((before,) if before else SOCKETS)
+                    before = 0  # where that did not help
             self._clock.sleep_until(self._clock.now() + BUSY_PAUSE_S)
             proceed()
 
@@ -328,15 +330,15 @@ class Line:
                 return
             except CodedError as error:
                 if error.code == BUFFER_FULL:
-                    self.cancel()
+                    self.cancel(SOCKETS)
                 if self._clock.now() >= end:
                     raise
             self._clock.sleep_until(self._clock.now() + BUSY_PAUSE_S)
 
-    def cancel(self) -> None:
-        """Cancel the commands that occupy the camera's sockets; waits for no answer."""
-        for command in CANCELS:
-            self._send(COMMAND, self._next(), command)
+    def cancel(self, places: Sequence[int]) -> None:
+        """Cancel the commands in the camera's sockets; waits for no answer."""
+        for place in places:
+            self._send(COMMAND, self._next(), bytes((CAMERA, 0x20 | place, END)))
 
     def close(self) -> None:
         """Release the connection."""
@@ -407,12 +409,11 @@ class Line:
             if hurried is None and self.hurry():
                 hurried = now + HURRY_S
             end = deadline if hurried is None else min(deadline, hurried)
-            ready = self._readable(min(max(end - now, 0.0), SLICE_S))
-            if ready:
+            if self._readable(min(max(end - now, 0.0), SLICE_S)) and now < end + SLICE_S:
                 self._read()
             elif self._clock.now() >= end:
                 return None
-        return self._inbox.pop(0)
+        return self._inbox.pop(0) if self._clock.now() < deadline + FLOOD_S else None
 
     def _readable(self, seconds: float) -> bool:
         return bool(select.select([self._socket], [], [], seconds)[0])

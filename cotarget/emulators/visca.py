@@ -34,6 +34,7 @@ VISCA_FAULTS = (
     "wrong-number",  # the next message is refused for its number
     "five-nibbles",  # pan has five nibbles
     "seven-nibbles",  # pan and tilt together have fifteen nibbles, as no camera's
+    "keeps-sockets",  # a command under way keeps its socket until it is done or cancelled
     "buffer-full",  # every command is refused
     "not-executable",  # every command but a stop is refused
     "standby",
@@ -203,15 +204,19 @@ class ViscaCamera:
                 raise RefusedError(FULL)
             if not is_stop and "not-executable" in self._faults:
                 raise RefusedError(NOT_NOW)
+            if len(self._running) == 2 and "keeps-sockets" in self._faults and not is_stop:
+                raise RefusedError(FULL)
             axes = self._execute(order)
         except RefusedError as error:
             reply(bytes([0x90, FAILED, error.args[0], 0xFF]))
             return
         for place, running in list(self._running.items()):
-            if running.axes == axes:  # a new command takes the place of the one under way
+            if (
+                running.axes == axes and "keeps-sockets" not in self._faults
+            ):  # a new command takes the place of the one under way
                 del self._running[place]
                 running.reply(bytes([0x90, FAILED | place, CANCELLED, 0xFF]))
-        place = next(each for each in (1, 2) if each not in self._running)
+        place = next((each for each in (1, 2) if each not in self._running), 1)
         reply(bytes([0x90, ACKNOWLEDGED | place, 0xFF]))
         if axes == "none":
             reply(bytes([0x90, DONE | place, 0xFF]))

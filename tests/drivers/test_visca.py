@@ -23,6 +23,7 @@ pytestmark = pytest.mark.wire
 GOAL_DEG = (20.0, -10.0)
 SLOW = math.radians(8.0)  # turns for seconds
 STOPPED_S = 0.5  # from a halt to rest: .1 s to repeat a lost stop, and braking from 8 degrees/s
+ENDS_S = 10.0  # two tries of .25 s and .2 s beyond, on a busy machine
 ROUNDING = 1e-9
 
 
@@ -194,6 +195,20 @@ def test_a_buffer_that_is_full_for_a_moment_delays_the_move():
         assert live.at() == goal(live)
 
 
+def test_a_camera_without_a_free_socket_gets_the_newest_move_and_goes_on_zooming():
+    live = LiveDome()
+    live.faults.set("keeps-sockets")
+    with opened(live) as dome:
+        reached = dome.zoom.zoom(2000.0)
+        for pan in (-20.0, 30.0, -30.0, 10.0):
+            dome.head.move(math.radians(pan), 0.0, speed=10 * SLOW)
+            time.sleep(0.1)
+        dome.head.move(math.radians(20.0), 0.0, wait=True)
+        assert live.at() == (288, 0)
+        wait_for(lambda: not dome.zoom.state().moving)
+        assert dome.zoom.state().focal_px == pytest.approx(reached, rel=ROUNDING)
+
+
 def test_a_camera_that_is_switched_off_in_mid_move_is_reported():
     live = LiveDome()
     with opened(live) as dome:
@@ -261,6 +276,18 @@ def test_wrong_addresses_say_what_was_tried():
             assert "answers 'SSH-2.0-x\\r\\n', which is no VISCA" in refusal(live, port=other.port, protocol="tcp")
         with TcpServer(lambda connection: connection.recv(100)) as busy:
             assert "closes the connection, as to a second program" in refusal(live, port=busy.port, protocol="tcp")
+
+
+@pytest.mark.parametrize("said", [b"\x00\x13\x37\xff", b"\x90\x41\xff", b"x" * 1000], ids=["noise", "answers", "text"])
+def test_an_endless_answer_ends_in_time(said):
+    def flood(connection):
+        while True:
+            connection.sendall(100 * said)
+
+    with LiveDome() as live, TcpServer(flood) as other:
+        begin = time.monotonic()
+        assert "no camera at 127.0.0.1 answers VISCA" in refusal(live, port=other.port, protocol="tcp")
+        assert time.monotonic() - begin < ENDS_S
 
 
 def test_wrong_units_are_named_with_those_that_fit():
