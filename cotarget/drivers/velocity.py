@@ -4,11 +4,13 @@ Positions and speeds are in the numbers of the axis's facts. Times are on the ri
 """
 
 from collections import deque
+from dataclasses import replace
 
 from cotarget.drivers.axes import AxisFacts
 from cotarget.drivers.lens import LensMotion
 
 SPEED_SHARE = 0.1  # relative standard deviation of a speed that nobody has measured
+SLOWEST = 1e-6  # a speed of zero would never arrive
 GAIN_HZ = 4.0  # of steering; above a third of the inverse of the unpredicted dead time it would overshoot
 FLOW_S = 0.5  # goals that follow each other as soon move along
 FLOW_GAIN = 0.4  # by which the newest pair of goals changes their estimated speed
@@ -17,47 +19,39 @@ FLOW_GAIN = 0.4  # by which the newest pair of goals changes their estimated spe
 class ReckonedAxis:
     """Where an axis should be by its commands.
 
+    Two motions with the same commands begin at the ends of the range; the position is known where they have met.
+
     Args:
         facts: range and highest speed of the axis.
         delay: time from a command to the start of motion [s].
     """
 
     def __init__(self, facts: AxisFacts, delay: float) -> None:
-        self._facts, self._delay = facts, delay
-        middle = (facts.lowest + facts.highest) / 2
-        self._motion = LensMotion(middle, middle, 0.0, facts.fastest)
-        self._sigma, self._sigma_t = (facts.highest - facts.lowest) / 2, 0.0  # of the position at a time
+        self._delay = delay
+        ends = (facts.lowest, facts.highest)
+        self._motions = [LensMotion(end, end, 0.0, facts.fastest) for end in ends]
 
     def correct(self, position: float, t: float) -> None:
         """Take a position that the device has said; a motion under way goes on from there."""
-        motion = self._motion
-        goal = position if t >= motion.arrives else motion.goal
-        self._motion = LensMotion(position, goal, max(t, motion.t), motion.speed)
-        self._sigma = 0.0
+        newest = self._motions[0]
+        goal = position if t >= max(motion.arrives for motion in self._motions) else newest.goal
+        self._motions = [LensMotion(position, goal, max(t, newest.t), newest.speed)] * 2
 
     def command(self, goal: float, speed: float, now: float) -> None:
-        """Start a motion to a goal; from the far end of the range, if nothing is known of the position."""
-        t, (here, sigma) = now + self._delay, self.at(now)
-        far = max((self._facts.lowest, self._facts.highest), key=lambda end: abs(end - goal))
-        start = far if sigma >= abs(self._facts.highest - self._facts.lowest) / 2 else here
-        self._motion = LensMotion(start, goal, t, max(speed, 1e-6))
-        self._sigma, self._sigma_t = sigma, now
+        """Start a motion to a goal."""
+        moved = [motion.toward(goal, now + self._delay) for motion in self._motions]
+        self._motions = [replace(motion, speed=max(speed, SLOWEST)) for motion in moved]
 
     def halt(self, now: float) -> None:
         """End the motion where the axis should be."""
-        here, self._sigma = self.at(now)
-        self._motion = LensMotion(here, here, now, self._facts.fastest)
+        places = [motion.position(now) for motion in self._motions]
+        self._motions = [LensMotion(place, place, now, 1.0) for place in places]
 
     def at(self, t: float) -> tuple[float, float]:
-        """Return the position at a time, and its standard deviation; a motion ends at its goal exactly."""
-        motion = self._motion
-        here = motion.position(t)
-        if (
-            t >= motion.arrives + SPEED_SHARE * (motion.arrives - motion.t) + self._delay
-            and motion.start != motion.goal
-        ):
-            return motion.goal, 0.0
-        return here, self._sigma + SPEED_SHARE * abs(here - motion.start)
+        """Return the position at a time, and its standard deviation."""
+        a, b = (float(motion.position(t)) for motion in self._motions)
+        here = (a + b) / 2
+        return here, abs(b - a) / 2 + SPEED_SHARE * abs(self._motions[0].goal - here)
 
 
 class SteeredAxis:

@@ -106,7 +106,7 @@ class ViscaSettings(PtzSettings):
             )
         )
         lens = AxisFacts(
-            unit=1.0, lowest=0, highest=OPTICAL, fastest=OPTICAL / ZOOM_S, step=1.0, slack=8, loses_steps=False
+            unit=1.0, lowest=0, highest=OPTICAL, fastest=OPTICAL / ZOOM_S, step=1.0, slack=32, loses_steps=False
         )
         return pan, tilt, lens
 
@@ -141,6 +141,7 @@ class ViscaLink(PtzLink):
         self._line, version = open_line(settings.host, settings.port, names, clock)
         self.name = self._line.name
         self._zoomed, self._polls = -math.inf, 0  # time of the last command for the lens, number of polls
+        self._moving_in = self._zooming_in = 0  # the camera's sockets of the last move and zoom
         with contextlib.ExitStack() as opened:
             opened.enter_context(contextlib.closing(self._line))
             self._refuse_standby()
@@ -183,12 +184,13 @@ class ViscaLink(PtzLink):
             _index(speeds_deg, speed * math.degrees(axis.unit))
             for speeds_deg, speed, axis in zip((family.pan, family.tilt), speeds, self.axes[:2], strict=True)
         )
-        self._send(protocol.absolute((round(a), round(b)), (pan, tilt), self._widths), requests)
+        order = protocol.absolute((round(a), round(b)), (pan, tilt), self._widths)
+        self._moving_in = self._send(order, requests, self._moving_in)
 
     def zoom(self, position: float, requests: Requests) -> None:
         """Send the lens to a position."""
         self._zoomed = self._clock.now()
-        self._send(protocol.zoom_to(round(position)), requests)
+        self._zooming_in = self._send(protocol.zoom_to(round(position)), requests, self._zooming_in)
 
     def halt(self, patience: float) -> None:
         """Stop pan and tilt; it is repeated until the camera has acknowledged it."""
@@ -199,10 +201,10 @@ class ViscaLink(PtzLink):
         """Release the connection."""
         self._line.close()
 
-    def _send(self, command: bytes, requests: Requests) -> None:
+    def _send(self, command: bytes, requests: Requests, before: int) -> int:
         self._line.hurry = requests.halt_waits
         try:
-            self._line.patiently(command, requests.proceed)
+            return self._line.patiently(command, requests.proceed, before)
         except SilentError:
             requests.proceed()
             raise

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from cotarget.drivers.link_errors import LostError, RefusedError, ReplyError, SilentError
-from cotarget.errors import DeviceError
+from cotarget.errors import ConfigError, DeviceError
 from cotarget.rig import Clock
 
 # Messages
@@ -32,7 +32,7 @@ ZOOM = bytes.fromhex("81 09 04 47 FF")
 # A valid speed must be given even here.
 STOP = bytes.fromhex("81 01 06 01 01 01 03 03 FF")
 DIGITAL_ZOOM_OFF = bytes.fromhex("81 01 04 06 03 FF")
-CANCELS = (bytes.fromhex("81 21 FF"), bytes.fromhex("81 22 FF"))  # the commands in socket 1 and 2
+SOCKETS = (1, 2)  # of a camera, each for a command under way
 STANDBY = 3  # answer to POWER
 SYNTAX, BUFFER_FULL, CANCELLED, NO_SOCKET, NOT_EXECUTABLE = 0x02, 0x03, 0x04, 0x05, 0x41
 ERRORS = {
@@ -168,6 +168,8 @@ CONNECT_S, GREETINGS = 1.0, 2  # for a TCP connection [s]; inquiries to each tra
 SLICE_S = 0.01  # [s]
 RECEIVE = 4096  # bytes
 LONGEST = 64  # bytes of a stream without an end of a message
+FLOOD_S = 0.2  # beyond a deadline, after which not even what has come is read: it may never end [s]
+MOST_DROPPED = 1000  # packets of a flood that are dropped at once
 SHOWN = 24  # bytes of a wrong answer in an error
 
 
@@ -252,8 +254,8 @@ class Line:
                 break
         raise self._silent()
 
-    def order(self, command: bytes, patience: float = TRIES * ANSWER_S, again_s: float = ANSWER_S) -> None:
-        """Send an order until it is acknowledged, each time with the same number.
+    def order(self, command: bytes, patience: float = TRIES * ANSWER_S, again_s: float = ANSWER_S) -> int:
+        """Send an order until it is acknowledged, each time with the same number; return the socket, 0 if unknown.
 
         Args:
             command: the order.
@@ -271,7 +273,7 @@ class Line:
             while (packet := self._receive(min(now + again_s, max(end, now + SLICE_S)))) is not None:
                 if self._is_abnormal(packet):
                     if repeated:  # it has the order, and its acknowledgement was lost
-                        return
+                        return 0
                     self._reset()
                     count = self._next()
                     break
@@ -283,7 +285,7 @@ class Line:
                 # A completion may be of an earlier order, unless its number says otherwise.
                 if answer.kind == 4 or (not answer.data and (packet.number == count or not answer.socket)):
                     self._answered = count
-                    return
+                    return answer.socket
             else:
                 repeated = True
             if self._clock.now() >= end:
@@ -291,12 +293,13 @@ class Line:
             if repeated and self.hurry() and command != STOP:
                 raise self._silent()
 
-    def patiently(self, command: bytes, proceed: Callable[[], None]) -> None:
-        """Send an order; send it again for `BUSY_S` where the camera refuses it for now.
+    def patiently(self, command: bytes, proceed: Callable[[], None], before: int = 0) -> int:
+        """Send an order; send it again for `BUSY_S` where the camera refuses it for now. Returns as `order` does.
 
         Args:
             command: the order.
             proceed: called before each repetition; raises where the order is not wanted any more.
+            before: socket of the order that this one replaces; it is cancelled where none is free.
 
         Raises:
             RefusedError: the camera refuses the order.
@@ -304,13 +307,13 @@ class Line:
         end = self._clock.now() + BUSY_S
         while True:
             try:
-                self.order(command)
-                return
+                return self.order(command)
             except CodedError as error:
                 if error.code not in (BUFFER_FULL, NOT_EXECUTABLE) or self._clock.now() >= end:
                     raise
                 if error.code == BUFFER_FULL:
-                    self.cancel()
+                    self.cancel((before,) if before else SOCKETS)
+                    before = 0  # where that did not help
             self._clock.sleep_until(self._clock.now() + BUSY_PAUSE_S)
             proceed()
 
@@ -327,15 +330,15 @@ class Line:
                 return
             except CodedError as error:
                 if error.code == BUFFER_FULL:
-                    self.cancel()
+                    self.cancel(SOCKETS)
                 if self._clock.now() >= end:
                     raise
             self._clock.sleep_until(self._clock.now() + BUSY_PAUSE_S)
 
-    def cancel(self) -> None:
-        """Cancel the commands that occupy the camera's sockets; waits for no answer."""
-        for command in CANCELS:
-            self._send(COMMAND, self._next(), command)
+    def cancel(self, places: Sequence[int]) -> None:
+        """Cancel the commands in the camera's sockets; waits for no answer."""
+        for place in places:
+            self._send(COMMAND, self._next(), bytes((CAMERA, 0x20 | place, END)))
 
     def close(self) -> None:
         """Release the connection."""
@@ -406,12 +409,11 @@ class Line:
             if hurried is None and self.hurry():
                 hurried = now + HURRY_S
             end = deadline if hurried is None else min(deadline, hurried)
-            ready = self._readable(min(max(end - now, 0.0), SLICE_S))
-            if ready:
+            if self._readable(min(max(end - now, 0.0), SLICE_S)) and now < end + SLICE_S:
                 self._read()
             elif self._clock.now() >= end:
                 return None
-        return self._inbox.pop(0)
+        return self._inbox.pop(0) if self._clock.now() < deadline + FLOOD_S else None
 
     def _readable(self, seconds: float) -> bool:
         return bool(select.select([self._socket], [], [], seconds)[0])
@@ -433,9 +435,8 @@ class Line:
                 self._inbox.append(packet)
             return
         if not data and self.transport.kind == socket.SOCK_STREAM:
-            raise LostError(
-                self.name, ConnectionResetError(errno.ECONNRESET, "it closes the connection, as to a second program")
-            )
+            closed = ConnectionResetError(errno.ECONNRESET, "it closes the connection, as to a second program")
+            raise LostError(self.name, closed) from closed
         *messages, rest = (self._stream + data).split(bytes([END]))
         self._stream = rest[-LONGEST:] if self.transport.kind == socket.SOCK_STREAM else b""
         for message in messages:
@@ -446,11 +447,13 @@ class Line:
         self.heard = rest or self.heard
 
     def _drain(self, quiet_s: float) -> int:
-        """Drop what has come, until nothing comes for a time [s]; return the number of answers to inquiries in it."""
-        for _ in range(TRIES):
-            if not self._readable(quiet_s):
+        """Drop what comes within a time [s]; return the number of answers to inquiries in it."""
+        end = self._clock.now() + quiet_s
+        for _ in range(MOST_DROPPED):
+            if self._readable(min(max(end - self._clock.now(), 0.0), SLICE_S)):
+                self._read()
+            elif self._clock.now() >= end or self.hurry():
                 break
-            self._read()
         dropped = [parse(packet.payload) for packet in self._inbox]
         self._inbox.clear()
         return sum(answer is not None and answer.kind == 5 and bool(answer.data) for answer in dropped)
@@ -488,34 +491,40 @@ def open_line(host: str, port: int, names: Sequence[str], clock: Clock) -> tuple
         clock: the rig's clock.
 
     Raises:
+        ConfigError: the address is not known.
         DeviceError: none of them answers; the message says what was tried, and what may help.
     """
     tried = []
     for transport in (TRANSPORTS[name] for name in names):
         words = transport.words.format(port or transport.port)
-        connection: socket.socket | None = None
-        try:
-            connection = _connect(host, port or transport.port, transport)
-            line = Line(connection, transport, f"{host} ({words})", clock)
-            version = line.greet()
-            connection = None
-            return line, version
-        except socket.gaierror as error:
-            raise DeviceError(
-                f"hardware.ptz.host: '{host}' is no address that is known here ({error.strerror})"
-            ) from None
-        except SilentError:
-            tried.append(f"{words}: {_what_came(line)}")
-        except (LostError, OSError) as error:
-            cause = error.__cause__ if isinstance(error, LostError) else error
-            tried.append(f"{words}: {getattr(cause, 'strerror', None) or cause}")
-        finally:
-            if connection is not None:
-                connection.close()
+        found = _greeted(host, port or transport.port, transport, f"{host} ({words})", clock)
+        if not isinstance(found, str):
+            return found
+        tried.append(f"{words}: {found}")
     raise DeviceError(
         f"no camera at {host} answers VISCA ({'; '.join(tried)}): check host and the camera's power, switch VISCA over "
         "IP on in its network settings, and set port if it has another one there"
     )
+
+
+def _greeted(host: str, port: int, transport: Transport, name: str, clock: Clock) -> tuple[Line, bytes] | str:
+    """Connect and greet; return the line and the answer to `VERSION`, or why that failed."""
+    why, line = "no answer", None
+    try:
+        line = Line(_connect(host, port, transport), transport, name, clock)
+        return line, line.greet()
+    except (socket.gaierror, UnicodeError):
+        raise ConfigError(f"hardware.ptz.host: '{host}' is no address that is known here") from None
+    except SilentError:
+        pass
+    except (LostError, OSError) as error:
+        cause = error.__cause__ if isinstance(error, LostError) else error
+        why = getattr(cause, "strerror", None) or str(cause)
+    if line is not None:
+        line.close()
+        if line.heard:
+            why = f"answers {ascii(line.heard[:SHOWN])[1:]}, which is no VISCA"
+    return why
 
 
 def _connect(host: str, port: int, transport: Transport) -> socket.socket:
@@ -530,7 +539,3 @@ def _connect(host: str, port: int, transport: Transport) -> socket.socket:
         connection.close()
         raise
     return connection
-
-
-def _what_came(line: Line) -> str:
-    return f"answers {ascii(line.heard[:SHOWN])[1:]}, which is no VISCA" if line.heard else "no answer"

@@ -9,6 +9,7 @@ Sources: Sony's EVI-D70 and SRG-300H manuals, PTZOptics' VISCA over IP command l
 import bisect
 import contextlib
 import math
+import random
 import select
 import socket
 import threading
@@ -22,7 +23,7 @@ from cotarget.errors import DeviceError
 
 VISCA_FAULTS = (
     "silence",  # it answers nothing, and obeys nothing
-    "lost-packets",  # every third datagram is lost, either way
+    "lost-packets",  # three datagrams of ten are lost, either way
     "lost-stop",  # the next stop is lost
     "lost-stop-answer",  # the answer to the next stop is lost
     "lost-move-answer",  # the answer to the next move is lost
@@ -33,6 +34,7 @@ VISCA_FAULTS = (
     "wrong-number",  # the next message is refused for its number
     "five-nibbles",  # pan has five nibbles
     "seven-nibbles",  # pan and tilt together have fifteen nibbles, as no camera's
+    "keeps-sockets",  # a command under way keeps its socket until it is done or cancelled
     "buffer-full",  # every command is refused
     "not-executable",  # every command but a stop is refused
     "standby",
@@ -49,7 +51,7 @@ SPEEDS_EVI = (
     (0, 2, 2.4, 3, 3.7, 4.7, 6.1, 7.4, 9.1, 11, 14, 18, 22, 27, 34, 42, 52, 65, 81, 100),
     (0, 2, 2.4, 3, 3.7, 4.7, 6.1, 7.4, 9.1, 11, 14, 18, 22, 27, 34, 42, 52, 65, 81),
 )
-# Zoom numbers and magnifications of a block of 25 x.
+# Zoom numbers and magnifications of a block of 25 x; digital zoom, which would go on, is not emulated.
 BLOCK = (
     (0x0000, 1.0), (0x1781, 2.0), (0x213B, 3.0), (0x2752, 4.0), (0x2BB3, 5.0), (0x315D, 7.0), (0x362C, 10.0),
     (0x3AFA, 15.0), (0x3DF8, 20.0), (0x4000, 25.0),
@@ -130,7 +132,8 @@ class ViscaCamera:
     def __init__(self, pan: AxisPlant, tilt: AxisPlant, lens: LensPlant, model: ViscaModel, faults: Faults) -> None:
         self._axes, self._lens, self._model, self._faults = (pan, tilt), lens, model, faults
         self._running: dict[int, Running] = {}  # by socket
-        self._on = True
+        self._on = self._was_on = True
+        self._zoomed = (-1, 0)  # the lens's position that a zoom number led to, and the number
         self.digital_zoom = True
 
     @property
@@ -154,10 +157,15 @@ class ViscaCamera:
                 reply(bytes([0x90, FAILED, SYNTAX, 0xFF]))
 
     def tick(self) -> bool:
-        """Report the completion of commands whose axes have come to rest; return whether any is under way."""
+        """Report the completion of commands whose axes have come to rest; return whether any is under way.
+
+        A camera that goes into standby stops.
+        """
+        if self._was_on and not self.is_on:
+            self._halt()
+        self._was_on = self.is_on
         for place, running in list(self._running.items()):
-            moving = any(axis.moving() for axis in self._axes) if running.axes == "head" else False
-            if not moving:
+            if running.axes == "lens" or not any(axis.moving() for axis in self._axes):
                 del self._running[place]
                 running.reply(bytes([0x90, DONE | place, 0xFF]))
         return bool(self._running)
@@ -196,15 +204,19 @@ class ViscaCamera:
                 raise RefusedError(FULL)
             if not is_stop and "not-executable" in self._faults:
                 raise RefusedError(NOT_NOW)
+            if len(self._running) == 2 and "keeps-sockets" in self._faults and not is_stop:
+                raise RefusedError(FULL)
             axes = self._execute(order)
         except RefusedError as error:
             reply(bytes([0x90, FAILED, error.args[0], 0xFF]))
             return
         for place, running in list(self._running.items()):
-            if running.axes == axes:  # a new command takes the place of the one under way
+            if (
+                running.axes == axes and "keeps-sockets" not in self._faults
+            ):  # a new command takes the place of the one under way
                 del self._running[place]
                 running.reply(bytes([0x90, FAILED | place, CANCELLED, 0xFF]))
-        place = next(each for each in (1, 2) if each not in self._running)
+        place = next((each for each in (1, 2) if each not in self._running), 1)
         reply(bytes([0x90, ACKNOWLEDGED | place, 0xFF]))
         if axes == "none":
             reply(bytes([0x90, DONE | place, 0xFF]))
@@ -242,7 +254,9 @@ class ViscaCamera:
                 self._go((0, 0), (0xFF, 0xFF))
                 return "head"
             case [0x04, 0x47, *where] if len(where) == 4 and "no-zoom" not in self._faults:
-                self._lens.command(self._lens_position(signed(bytes(where)) & 0xFFFF))
+                number = min(signed(bytes(where)) & 0xFFFF, TELE)
+                self._zoomed = self._lens_position(number), number
+                self._lens.command(self._zoomed[0])
                 return "lens"
             case [0x04, 0x07, way] if "no-zoom" not in self._faults:
                 self._lens.command({0: self._lens.position(), 3: 0}.get(way >> 4 or way, self._lens.last))
@@ -286,10 +300,12 @@ class ViscaCamera:
 
     def _lens_position(self, number: int) -> int:
         """Return the lens's position of a zoom number; its positions are even in the logarithm of the focal length."""
-        share = _interpolate([(float(a), math.log(b)) for a, b in BLOCK], min(number, TELE)) / math.log(BLOCK[-1][1])
+        share = _interpolate([(float(a), math.log(b)) for a, b in BLOCK], number) / math.log(BLOCK[-1][1])
         return round(share * self._lens.last)
 
     def _zoom_number(self) -> int:
+        if self._lens.position() == self._zoomed[0]:
+            return self._zoomed[1]
         log = self._lens.position() / self._lens.last * math.log(BLOCK[-1][1])
         return round(_interpolate([(math.log(b), float(a)) for a, b in BLOCK], log))
 
@@ -310,7 +326,7 @@ def lens_table(magnification: float) -> list[list[float]]:
 
 TICK_S = 0.005  # period of looking for completed commands [s]
 LATE_S = 0.4
-THIRD = 3  # of the fault lost-packets
+LOST = 0.3  # of the datagrams, by the fault lost-packets
 RECEIVE, LONGEST = 4096, 64  # bytes
 COMMANDS, REPLY, CONTROL, CONTROL_REPLY = (0x0100, 0x0110), 0x0111, 0x0200, 0x0201
 DRIVE, ABSOLUTE = b"\x06\x01", b"\x06\x02"
@@ -340,7 +356,7 @@ class ViscaServer(Closes):
         self._numbers: dict[tuple[str, int], int] = {}  # the last number of each client
         self._clients: dict[socket.socket, bytes] = {}  # of TCP, with the begin of a message
         self._delayed: list[tuple[float, Callable[[], None]]] = []
-        self._datagrams = 0
+        self._luck = random.Random(0)
         with contextlib.ExitStack() as opened:
             self._sony, self._bare = (opened.enter_context(_open_udp(host, port)) for port in ports[:2])
             self._listener = opened.enter_context(open_listener(host, ports[2]))
@@ -429,14 +445,11 @@ class ViscaServer(Closes):
             self._take(payload, answer)
 
     def _is_lost(self, message: bytes) -> bool:
-        return (
-            "silence" in self._faults or self._is_third() or (message[2:4] == DRIVE and self._faults.take("lost-stop"))
-        )
+        return "silence" in self._faults or self._loses() or (message[2:4] == DRIVE and self._faults.take("lost-stop"))
 
-    def _is_third(self) -> bool:
-        """Count a datagram; return whether it is the third that gets lost."""
-        self._datagrams += 1
-        return "lost-packets" in self._faults and self._datagrams % THIRD == 0
+    def _loses(self) -> bool:
+        """Draw whether a datagram gets lost."""
+        return "lost-packets" in self._faults and self._luck.random() < LOST
 
     def _take(self, message: bytes, send: Callable[[bytes], object], is_stream: bool = False) -> None:
         """Pass a message to the firmware, and its answers on, as far as the faults leave them."""
@@ -445,7 +458,7 @@ class ViscaServer(Closes):
         )
 
         def reply(answer: bytes) -> None:
-            if loses or "silence" in self._faults or (not is_stream and self._is_third()):
+            if loses or "silence" in self._faults or (not is_stream and self._loses()):
                 return
             if "garbage" in self._faults:
                 _quietly(send, NOISE)
@@ -469,6 +482,8 @@ def _open_udp(host: str, port: int) -> socket.socket:
         DeviceError: the address is invalid or in use.
     """
     opened = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
+    # Programs that bind the camera's port on all addresses can then share it, as on another machine.
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         opened.bind((host, port))
     except OSError as error:
