@@ -129,6 +129,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 SETTINGS = DisturbedSettings()
 QUICK = dataclasses.replace(
-    SETTINGS, seeds=1, seconds=10.0, calibrated=False, targets=("bird",), nudges_deg=(0.3,), late_s=(0.06,)
+    SETTINGS, seeds=1, seconds=10.0, calibrated=False, targets=("bird",), nudges_deg=(0.3,), late_s=()
 )
 COST_S = 600.0
