@@ -143,6 +143,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 SETTINGS = FrameSizesSettings()
-QUICK = replace(SETTINGS, frames=35, untimed=20)
+QUICK = replace(SETTINGS, frames=30, untimed=16)
 ALONE = True
 COST_S = 60.0

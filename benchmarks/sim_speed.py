@@ -243,6 +243,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 SETTINGS = SimSpeedSettings()
-QUICK = replace(SETTINGS, seeds=1, steps=3, seconds_rendered=0.4, seconds=2.0, calibrated=False)
+QUICK = replace(SETTINGS, seeds=1, steps=2, seconds_rendered=0.4, seconds=2.0, calibrated=False)
 ALONE = True
 COST_S = 160.0

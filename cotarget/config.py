@@ -462,6 +462,8 @@ class NetworkConfig:
     std: Annotated[tuple[Positive, Positive, Positive], "[red, green, blue]"] = (255.0, 255.0, 255.0)
 
 
+# Largest roll that boxes do not show [rad]: it makes a slim one a tenth wider, and a stride half as wide again.
+LEVEL = math.radians(10.0)
 GOOD_SIZE = (0.8, 1.25)  # of `wanted_px`: range in which a close-up counts as of the wanted size
 
 
@@ -517,8 +519,9 @@ class TargetProfile:
         """Find the angle from the image's v axis to the target's own vertical axis, by the shape of its box [rad].
 
         The axis lies between the v axis and the head's pan axis, because either may be the vertical: a camera may be
-        mounted sideways, or the head. The box of an ellipse of the usual shape tells where; without a usual shape, and
-        for a template, whose box does not turn with it, it is the pan axis.
+        mounted sideways, or the head. The box of an ellipse of the usual shape tells where, from a roll of `LEVEL` on;
+        below, it is the v axis. Without a usual shape, and for a template, whose box does not turn with it, it is the
+        pan axis.
 
         Args:
             width: width of the box, above 0.
@@ -527,6 +530,8 @@ class TargetProfile:
         """
         if self._slimness is None:
             return roll
+        if abs(roll) < LEVEL:
+            return 0.0
         box, usual, slim = (width / height) ** 2, self._slimness**2, math.copysign(1.0, 1 - self._slimness)
         over, under = slim * (box - usual), slim * (1 - box * usual)
         turned = 0.0 if over <= 0 else math.atan2(math.sqrt(over), math.sqrt(max(under, 0.0)))

@@ -288,6 +288,7 @@ class TargetFusion:
 
     Attributes:
         targets: targets by id, in the order of the tracks.
+        camera: the fixed camera, as the newest frame shows it to be turned.
     """
 
     def __init__(
@@ -300,6 +301,29 @@ class TargetFusion:
         self._profile, self._settings = profile, settings
         self._make_filter = partial(TargetFilter, calibration, profile, filter or filter_settings(profile, calibration))
         self.targets: dict[int, Target] = {}
+        self.camera = calibration.fixed
+        self._lost_view = False
+
+    def add_shift(self, shift_px: Array | None, *, cut: bool) -> None:
+        """Turn the fixed camera as its scene has shifted.
+
+        Args:
+            shift_px: shift of the scene since the first frame (du, dv) [px], (2,); None if it is not measured.
+            cut: whether the newest frame shows another scene than the one before; by how much it was turned is then not
+                known.
+        """
+        self._lost_view |= cut
+        turned = self.camera if shift_px is None else self.camera.turned(shift_px)
+        # Clouds and foliage move the measured shift by a standard deviation of about a step of the head.
+        if math.dist(turned.turn, self.camera.turn) > math.sqrt(GATE) * HEAD_SIGMA:
+            self.camera = turned
+
+    def warnings(self) -> list[str]:
+        """Describe how the fixed camera has been moved since the first frame, a sentence each."""
+        if self._lost_view:
+            return ["the fixed camera shows another scene: if it was moved, calibrate again"]
+        turn = math.degrees(math.hypot(*self.camera.turn))
+        return [f"the fixed camera was turned by {turn:.1g} degrees, and aims follow"] if turn else []
 
     def add_tracks(
         self,
@@ -382,7 +406,7 @@ class TargetFusion:
                 if self._profile.matcher == "upright":  # a box without the feet has its middle too high
                     upright = np.array([math.sin(view.turn), math.cos(view.turn)])
                     sigma_px = np.hypot(sigma_px, upright * (box.size_px - track.size_px) / 2)
-        target.filter.add_fixed(box, frame.t, sigma_px=sigma_px, size_px=size_px)
+        target.filter.add_fixed(box, frame.t, sigma_px=sigma_px, size_px=size_px, camera=self.camera)
 
 
 def _was_part(target: Target) -> bool:

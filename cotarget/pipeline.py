@@ -670,6 +670,7 @@ class Run:
         frame = frames.read_fixed()
         detections, tracks = self.camera.track(frame), self.camera.tracks
         favoured = {track.id for track in tracks if head.selector.favours(track)}
+        self.fusion.add_shift(detections.shift, cut=detections.cut)
         self.fusion.add_tracks(frame, tracks, detections.mask, [head.search], favoured)
         head.read_states()
         zoom = frames.read_zoom()
@@ -682,7 +683,7 @@ class Run:
             index=self._index - 1,
             t=self._rig.clock.now(),
             state=state,
-            reason=_joined([*reasons, *head.search.warnings(estimate), *frames.faults()]),
+            reason=_joined([*reasons, *head.search.warnings(estimate), *self.fusion.warnings(), *frames.faults()]),
             fixed=frame,
             zoom=zoom,
             mask=detections.mask,

@@ -13,7 +13,7 @@ import numpy as np
 
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
-from cotarget.geometry import Array, RigidTransform
+from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry, base_head, zoom_fixed
 
 
@@ -23,9 +23,12 @@ class FixedCamera:
 
     Attributes:
         lens: intrinsics.
+        turn: rotation vector (x, y) by which it has been turned since it was calibrated [rad]. The frame "fixed" stays
+            where it was, because the head's base is calibrated against it.
     """
 
     lens: Intrinsics
+    turn: tuple[float, float] = (0.0, 0.0)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -42,7 +45,23 @@ class FixedCamera:
 
     def resized(self, size: tuple[int, int]) -> "FixedCamera":
         """Return the same camera for a stream scaled to another size (width, height) [px]."""
-        return FixedCamera(self.lens.resized(size))
+        return replace(self, lens=self.lens.resized(size))
+
+    def turned(self, shift_px: Array) -> "FixedCamera":
+        """Return the camera as it has been turned if its scene has shifted in the image by (du, dv) [px]."""
+        (du, dv), (fx, fy) = np.asarray(shift_px).tolist(), self.lens.focal_px
+        return replace(self, turn=(math.atan2(dv, fy), -math.atan2(du, fx)))
+
+    def tangents(self, pixel: Array) -> tuple[Array, Array] | None:
+        """Compute the tangents of a pixel in the frame "fixed", and their derivative; see `Intrinsics.tangents`."""
+        found = self.lens.tangents(pixel)
+        if found is None or self.turn == (0.0, 0.0):
+            return found
+        (x, y), J = found
+        R = Rotation.from_rotvec([*self.turn, 0.0]).as_matrix()
+        ray = R @ (x, y, 1.0)
+        tangent = ray[:2] / ray[2]
+        return tangent, (R[:2, :2] - np.outer(tangent, R[2, :2])) / ray[2] @ J
 
 
 @dataclass(frozen=True, eq=False)

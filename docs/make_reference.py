@@ -74,9 +74,10 @@ def _tables(where: str, cls: type[Any], driver: str = "") -> Iterator[str]:
         names = DRIVERS[where.rpartition(".")[2]]
         first = next(iter(names))
         anchor += "" if driver == first else f".{driver}"
-        title += "" if len(names) == 1 else f" with driver `{driver}`"
+        title += "" if len(names) == 1 and where != "hardware.ptz" else f" with driver `{driver}`"
         choices = f'{", ".join(json.dumps(name) for name in names)} or `"module:class"`'
-        rows.insert(0, ("`driver`", "string", "", f"`{json.dumps(first)}`", choices, f"the driver; here `{driver}`"))
+        default = "required" if where == "hardware.ptz" else f"`{json.dumps(first)}`"
+        rows.insert(0, ("`driver`", "string", "", default, choices, f"the driver; here `{driver}`"))
     yield _heading(title, anchor)
     yield (cls.__doc__ or "").partition("Attributes:")[0].replace("\n    ", "\n").strip() + "\n"
     yield _grid(("key", "type", "unit", "default", "range", "meaning"), rows) if rows else ""

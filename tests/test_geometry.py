@@ -1,5 +1,6 @@
 """Geometry: poses and angles, and that of a calibrated rig by hand-worked rigs and by the simulated truth."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -85,6 +86,22 @@ def test_without_a_calibrated_head_there_is_no_pose_in_the_base():
     for wanted in (head.hand_eye, lambda: head.in_base(np.ones(3)), lambda: head.project(np.ones(3), 0, 0, 500.0)):
         with pytest.raises(CalibrationError, match="no T_head_zoom"):
             wanted()
+
+
+def test_a_turned_fixed_camera_gives_the_rays_of_before():
+    """OpenCV projects points into a camera that was turned; the shift of the point ahead tells by how much."""
+    size, center, focal, distortion = (640, 480), (319.5, 239.5), 500.0, np.array([-0.2, 0.0, 0.0, 0.0])
+    K = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1.0]])
+    rotated = np.radians([0.6, -0.8, 0.0])  # from the frame before to the turned camera's
+    seen = cv2.projectPoints(
+        np.array([[0, 0, 1], [0.3, -0.2, 1], [0.3001, -0.2, 1]]), rotated, np.zeros(3), K, distortion
+    )
+    ahead, there, beside = seen[0][:, 0]
+    camera = FixedCamera(Intrinsics(size, (focal, focal), center, (*distortion.tolist(), 0.0))).turned(ahead - center)
+    tangent, slope = camera.tangents(there)
+    np.testing.assert_allclose(tangent, [0.3, -0.2], atol=1e-4)  # 0.05 px
+    np.testing.assert_allclose(slope @ (beside - there), [1e-4, 0.0], atol=1e-7)
+    assert camera.resized((320, 240)).turn == camera.turn
 
 
 def test_cameras_follow_the_size_of_their_streams():

@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from cotarget.cli.common import add_file, check_outputs, duration, port, previous_kept, rig_files
@@ -24,20 +25,43 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_file(parser, "--rig", "rig.toml of the simulated rig (the default rig)")
     add_file(parser, "--write", "rig.toml to write, which connects to it", required=True)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
-    for name in ("head", "fixed", "zoom", "board", "control"):
+    parser.add_argument("--head", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
+    about = "axis or rtsp, and the port to listen at; or the port alone (axis, at any free port)"
+    parser.add_argument("--fixed", type=protocol_and_port, default=0, metavar="PROTOCOL[:PORT]", help=about)
+    for name in ("zoom", "board", "control"):
         parser.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
-    parser.add_argument("--tcp", action="store_true", help="connect the head by TCP instead of a serial port")
-    parser.add_argument("--user", default="", metavar="NAME", help="user name that the fixed camera asks for (none)")
+    about = "emulate head and zoom camera as one dome that is moved by this protocol (a PTU-D46 and a PowerShot)"
+    parser.add_argument("--ptz", choices=("onvif", "visca"), help=about)
+    about = "what the dome does otherwise than the standard, by its names of the list of ptz faults below"
+    parser.add_argument("--profile", type=lambda text: text.split(","), default=[], metavar="NAME[,NAME]", help=about)
+    about = "units of a VISCA dome (ptzoptics)"
+    parser.add_argument("--units", choices=("ptzoptics", "evi_d70", "evi_d80"), default="ptzoptics", help=about)
+    about = "connect the head by TCP instead of a serial port, or a VISCA dome instead of by UDP"
+    parser.add_argument("--tcp", action="store_true", help=about)
+    parser.add_argument("--user", default="", metavar="NAME", help="user name that cameras and dome ask for (none)")
     about = "fault to be on from the start, one of those below; the control socket switches faults later"
     parser.add_argument("--fault", action="append", default=[], metavar="DEVICE.FAULT", help=about)
     parser.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
 
 
+def protocol_and_port(text: str) -> tuple[str, int]:
+    """Parse the fixed camera's protocol, its port, or both."""
+    name, _, number = ("axis", "", text) if text.isdigit() else text.partition(":")
+    if name not in ("axis", "rtsp"):
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a port nor axis or rtsp, such as rtsp:8554")
+    return name, port(number or "0")
+
+
 def epilog() -> str:
     """List the faults that can be switched on, for --help."""
-    from cotarget.emulators.emulation import FAULTS
+    from cotarget.emulators.emulation import DOMES, FAULTS, FIXED
 
-    return "faults: " + ", ".join(f"{device}.{name}" for device, names in FAULTS.items() for name in names)
+    def listed(faults: Mapping[str, Iterable[str]]) -> str:
+        return ", ".join(f"{device}.{name}" for device, names in faults.items() for name in names)
+
+    lines = [f"faults: {listed(FAULTS)}", f"faults with --fixed rtsp: {listed({'fixed': FIXED['rtsp']})}"]
+    lines += [f"faults with --ptz {name}: {listed({'ptz': faults})}" for name, faults in DOMES.items()]
+    return "\n".join([*lines, f"faults of the picture of a dome: {listed({'picture': FIXED['rtsp']})}"])
 
 
 def run(options: argparse.Namespace) -> None:
@@ -46,7 +70,7 @@ def run(options: argparse.Namespace) -> None:
     sys.setswitchinterval(SWITCH_S)
     from cotarget.backends import load_config
     from cotarget.config import RigConfig, SimConfig, read_tables
-    from cotarget.emulators.emulation import Emulation, Ports, copied_tables, parse_fault
+    from cotarget.emulators.emulation import Emulation, Ports, copied_tables, faults_of, parse_fault
     from cotarget.emulators.world import paced
     from cotarget.files import write_atomically
 
@@ -57,24 +81,30 @@ def run(options: argparse.Namespace) -> None:
     if options.rig is not None:
         beside = copied_tables(read_tables(options.rig), options.rig.parent)
     check_outputs([options.write], rig_files(options.rig, config))
-    for fault in options.fault:
-        with naming("--fault"):
-            parse_fault(fault)
-    ports = Ports(options.host, options.head, options.fixed, options.zoom, options.board, options.control)
+    protocol, fixed_port = options.fixed or ("axis", 0)
+    if options.profile and not options.ptz:
+        raise ConfigError("--profile: is of a dome; give --ptz onvif")
+    faults = {
+        fault: option
+        for option, names in (("--fault", options.fault), ("--profile", [f"ptz.{name}" for name in options.profile]))
+        for fault in names
+    }
+    for fault, option in faults.items():
+        with naming(option):
+            parse_fault(fault, faults_of(protocol, options.ptz or ""))
+    ports = Ports(options.host, options.head, fixed_port, options.zoom, options.board, options.control)
     password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
     if options.user and not password:
         raise ConfigError("--user needs a password: put it into the environment variable COTARGET_PASSWORD")
-    with Emulation(paced(config), ports, user=options.user, password=password) as emulation:
-        for fault in options.fault:
+    how = {"fixed": protocol, "dome": options.ptz or "", "units": options.units}
+    with Emulation(paced(config), ports, user=options.user, password=password, **how) as emulation:
+        for fault in faults:
             emulation.switch(fault)
         with previous_kept(options.write):
             write_atomically(options.write, emulation.rig_toml(tcp=options.tcp, beside=beside).encode())
+        for name, address in emulation.addresses.items():
+            print(f"{name:<8} {address}")
         print(
-            f"head     {emulation.head.port} and {emulation.head.url}\n"
-            f"fixed    {emulation.fixed.url}/mjpg/video.mjpg\n"
-            f"zoom     ptpip:{options.host}:{emulation.zoom.port}:{emulation.zoom.port}\n"
-            f"board    socket://{options.host}:{emulation.board.port}\n"
-            f"control  socket://{options.host}:{emulation.control.port}\n"
             f"targets  {', '.join(config.sim.targets) or NO_TARGET}\n"
             f"{options.write} connects to them; Ctrl-C ends them",
             flush=True,

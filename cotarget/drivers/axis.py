@@ -111,7 +111,7 @@ class VideoServer:
         self._socket: socket.socket | None = None  # of the response that is being read
         self._ended = False
         self._lock = threading.Lock()
-        self._httpx = _import_httpx()
+        self._httpx = import_httpx()
         try:
             self._client: httpx.Client = self._httpx.Client(
                 base_url=self.name,
@@ -356,7 +356,12 @@ def _authentication(user: str, password: str) -> "httpx.Auth":
     return DemandedAuth()
 
 
-def _import_httpx() -> ModuleType:
+def import_httpx() -> ModuleType:
+    """Import httpx.
+
+    Raises:
+        MissingPackageError: it is missing.
+    """
     try:
         import httpx
     except ImportError:

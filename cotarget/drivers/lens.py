@@ -1,5 +1,6 @@
 """Zoom lenses that are driven by position: focal length of a position, and estimated position during a motion."""
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -29,7 +30,8 @@ class LensPositions:
         """Return the position [1] nearest to a nominal focal length [px], of those that the lens can be sent to."""
         at, mm = zip(*self.knots, strict=True)
         exact = np.interp(np.log(focal_px * self.pitch_mm), np.log(mm), at)
-        return min(self.positions, key=lambda position: abs(position - exact))
+        above = bisect_left(self.positions, exact)
+        return min(self.positions[max(above - 1, 0) : above + 1], key=lambda position: abs(position - exact))
 
     @property
     def focal_range(self) -> tuple[float, float]:

@@ -409,6 +409,7 @@ class Loop:
 
 OF_A_UNIT = ("poll", "move", "halt", "close")  # methods of a `HeadLink` that have no default
 STANDS_S = 5.0  # time limit for a head that turned when it was opened to stand after the halt [s]
+LENS_STANDS_S = 1.0  # a lens is only known to stand after some polls; one that moves is not waited for [s]
 HALT_S = 1.0  # time limit for the answer to a halt, beyond braking; synchronising the line may come first [s]
 CLOSE_S = 5.0  # time limit for the thread to end [s]
 CHECK_S = 0.2  # a caller that waits for a move checks with this period whether the thread still runs [s]
@@ -617,9 +618,9 @@ class PolledHead:
             raise kind(str(move.error)) from move.error
 
     def _wait_until_it_stands(self, clock: Clock) -> None:
-        deadline = clock.now() + STANDS_S
-        while self._loop.snapshot.moving:
-            if clock.now() > deadline:
+        begin = clock.now()
+        while self._loop.snapshot.moving or (self._loop.lens_snapshot.moving and clock.now() < begin + LENS_STANDS_S):
+            if clock.now() > begin + STANDS_S:
                 raise DeviceError(
                     f"the pan-tilt unit at {self._link.name} does not come to rest though it was halted; "
                     f"{self._loop.why_restless()}"

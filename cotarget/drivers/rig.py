@@ -243,11 +243,11 @@ def device_of(role: str, table: Mapping[str, Any]) -> Device:
         ConfigError: there is no such driver, or it refuses the table.
     """
     where, known = f"hardware.{role}", DRIVERS[role]
-    name = table.get(KEY, next(iter(known), None))
+    name = table.get(KEY, None if role == "ptz" else next(iter(known)))
     own = isinstance(name, str) and is_own(name)
     if not own and name not in known:
-        also = f"neither {FORM} nor one of: {choices(known)}" if known else f"not {FORM}"
-        raise ConfigError(f"{where}.{KEY}: {name!r} is {also}" if name else f"{where}.{KEY}: is missing; give {FORM}")
+        also = f"{name!r} is neither {FORM} nor" if name else f"is missing; give {FORM} or"
+        raise ConfigError(f"{where}.{KEY}: {also} one of: {choices(known)}")
     driver = load(name if own else known[name], f"{where}.{KEY}")
     if not is_dataclass(settings := getattr(driver, "Settings", None)) or not hasattr(settings, "spec"):
         raise ConfigError(f"{where}.{KEY}: {name} has no Settings, a dataclass of its keys in rig.toml with a spec")

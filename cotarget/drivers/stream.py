@@ -78,7 +78,12 @@ def _kind(url: str) -> Kind:
     return KINDS[urlsplit(url).scheme] if "://" in url else FILM
 
 
-def _address(url: str) -> str:
+def stream_address(url: str) -> str:
+    """Check the address of a stream.
+
+    Raises:
+        ValueError: it is none, or has a password in it.
+    """
     try:
         parts = urlsplit(url)
         valid = "://" not in url or (parts.scheme in KINDS and bool(parts.hostname) and parts.port != 0)
@@ -107,7 +112,7 @@ class StreamSettings:
         latency_s: time from light to a frame's arrival, as measured [s].
     """
 
-    url: Annotated[str, Needed(EXAMPLE), Check(_address)] = ""
+    url: Annotated[str, Needed(EXAMPLE), Check(stream_address)] = ""
     user: str = ""
     password: str = ""
     password_env: str = "COTARGET_PASSWORD"

@@ -5,8 +5,6 @@ authentication, and has faults that can be switched on (`AXIS_FAULTS`). A thread
 delays no other one, and gets the newest image when it is ready.
 """
 
-import base64
-import hashlib
 import math
 import re
 import secrets
@@ -17,15 +15,13 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from email.message import Message
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
-from typing import Literal
 from urllib.parse import parse_qsl, urlsplit
-from urllib.request import parse_http_list, parse_keqv_list
 
 import numpy as np
 
+from cotarget.emulators.authentication import Authenticator, Scheme
 from cotarget.emulators.plant import Feed, Picture, encode_jpeg
 from cotarget.emulators.serve import LOCAL, Faults, TcpServer
 
@@ -57,54 +53,6 @@ def error_reply(error: HttpError) -> bytes:
     body = f"<HTML><BODY><H1>{error.status.value} {error.status.phrase}</H1></BODY></HTML>\r\n".encode("latin-1")
     headers = [*error.headers, "Content-Type: text/html", f"Content-Length: {len(body)}"]
     return reply_head(error.status, headers) + body
-
-
-# Authentication: basic and digest of RFC 2617 with qop=auth
-
-Scheme = Literal["digest", "basic"]
-
-
-def _md5(*words: str) -> str:
-    return hashlib.md5(":".join(words).encode(), usedforsecurity=False).hexdigest()
-
-
-@dataclass(frozen=True)
-class Authenticator:
-    """Check the authorization of requests."""
-
-    user: str  # empty if everyone may connect
-    password: str
-    scheme: Scheme
-    realm: str
-    nonce: str  # of digest authentication; it never expires
-
-    @property
-    def challenge(self) -> str:
-        """Header line that demands authentication."""
-        if self.scheme == "basic":
-            return f'WWW-Authenticate: Basic realm="{self.realm}"'
-        return f'WWW-Authenticate: Digest realm="{self.realm}", nonce="{self.nonce}", algorithm=MD5, qop="auth"'
-
-    def allows(self, method: str, target: str, headers: Message) -> bool:
-        """Return whether a request is allowed; ``target`` is as in the request line, with the arguments."""
-        if not self.user:
-            return True
-        scheme, _, rest = headers.get("Authorization", "").partition(" ")
-        if scheme.lower() != self.scheme:
-            return False
-        if self.scheme == "basic":
-            return rest.strip() == base64.b64encode(f"{self.user}:{self.password}".encode()).decode()
-        try:
-            fields = parse_keqv_list(parse_http_list(rest))
-        except (ValueError, IndexError):
-            return False
-        names = ("username", "realm", "uri", "qop", "nonce", "nc", "cnonce", "response")
-        user, realm, uri, qop, nonce, count, cnonce, response = (fields.get(name, "") for name in names)
-        if (user, realm, uri, qop, nonce) != (self.user, self.realm, target, "auth", self.nonce):
-            return False
-        # RFC 2617, 3.2.2.1
-        secret = _md5(user, realm, self.password)
-        return response == _md5(secret, nonce, count, cnonce, qop, _md5(method, uri))
 
 
 # Images: requested by VAPIX arguments, scaled and encoded

@@ -23,7 +23,7 @@ from cotarget.errors import CotargetError, DeviceError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Image
 from cotarget.sim.motion import Axis, LensDrive
-from cotarget.sim.truth import CameraName
+from cotarget.sim.truth import CameraName, Truth
 from cotarget.sim.world import SimWorld
 
 log = logging.getLogger(__name__)
@@ -211,6 +211,10 @@ class LiveWorld(Closes):
     def head_truth(self) -> tuple[float, float]:
         """Return the true pan and tilt of the platform now [rad], independent of the unit's count."""
         return self._world.head_drive.angles_at(self.clock.now())
+
+    def truth(self) -> Truth:
+        """Return the ground truth, also of past times."""
+        return self._world.truth()
 
     def close(self) -> None:
         """End the threads and release the renderer; may be called again."""

@@ -44,6 +44,7 @@ from cotarget.estimation.motion_model import (
 )
 from cotarget.geometry import Array
 from cotarget.rig import Detection
+from cotarget.rig_geometry import FixedCamera
 
 
 @dataclass(frozen=True)
@@ -308,7 +309,13 @@ class TargetFilter:
         self._nodes: list[Node | None] = []  # state after each of them; None before the first in the fixed image
 
     def add_fixed(
-        self, detection: Detection, t: float, *, sigma_px: Array | None = None, size_px: float | None = None
+        self,
+        detection: Detection,
+        t: float,
+        *,
+        sigma_px: Array | None = None,
+        size_px: float | None = None,
+        camera: FixedCamera | None = None,
     ) -> bool:
         """Add a detection in the fixed image.
 
@@ -319,11 +326,12 @@ class TargetFilter:
                 with half the box in addition if it is clipped, whose hidden part may be as large again.
             size_px: known dimension in the image [px], if it is better known than from this box alone, such as the
                 largest over a wing beat.
+            camera: the fixed camera as it was turned at that time; by default as it was calibrated.
 
         Returns:
             False if the measurement is older than all that is kept, is a duplicate, or has a pixel without a ray.
         """
-        found = self._calibration.fixed.lens.tangents(detection.center_px)
+        found = (camera or self._calibration.fixed).tangents(detection.center_px)
         if found is None:
             return False
         z, J = found

@@ -1,4 +1,4 @@
-"""Simple controllers and an oracle beside the project's: each takes the arguments of `follow` and gives its Steps.
+"""Simple controllers and an oracle beside the project's: each is given a Task and gives the Steps of `follow`.
 
     sixty lines     largest blob of MOG2, or the best box of the given detector, near the last one; constant-velocity
                     Kalman filter in 3D on the depth from the size; exact aim at where it predicts the target to be
@@ -37,7 +37,7 @@ from cotarget.targeting import Aim, WantedSize, aim, depth_of, point_at
 from experiments.engine import Row
 from experiments.following.field import FieldSettings, calibrated, held, watched_in
 from experiments.following.wide_view import open_on, record
-from experiments.paper.paper_loop import Follow
+from experiments.paper.paper_loop import Follow, Task
 from experiments.tables import SPREAD, grouped, spread
 
 OURS, ORACLE = "this project", "oracle"
@@ -185,23 +185,15 @@ class Filter:
             return None
 
 
-def _simple(
-    way: str,
-    rig: Rig,
-    calibration: Calibration,
-    target: TargetProfile,
-    detector: Detector,
-    *,
-    seconds: float,
-    settings: FollowSettings,
-) -> Iterator[Step]:
-    """Follow a target by one of the simple controllers; arguments, Steps and errors are those of `follow`."""
-    calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
+def _simple(way: str, task: Task) -> Iterator[Step]:
+    """Follow a target by one of the simple controllers."""
+    rig, target = task.rig, task.target
+    calibration = task.calibration.for_streams(rig.fixed.size, rig.zoom.size)
     gains = GAINS[target.motion]
-    find = Blobs() if gains.blobs else partial(detected, detector)
+    find = Blobs() if gains.blobs else partial(detected, task.detector)
     state, command = Filter(calibration, target, gains), _Commands(rig)
     moves_at = -math.inf  # time at which the last command has begun to move the head [s]
-    for frame, interval in command.frames(seconds):
+    for frame, interval in command.frames(task.seconds):
         state.add(find(frame), interval)
         now, found = rig.clock.now(), None
         if not state.followed or state.x is None or state.seen is None:
@@ -291,22 +283,13 @@ ORACLE_HEAD = HeadSettings(deadband=False, slow=0.0, catch_s=0.08, hurry_s=0.08)
 ORACLE_LENS_CHANGE = 0.02
 
 
-def _oracle(
-    world: SimWorld,
-    name: str,
-    rig: Rig,
-    calibration: Calibration,
-    target: TargetProfile,
-    detector: Detector,
-    *,
-    seconds: float,
-    settings: FollowSettings,
-) -> Iterator[Step]:
+def _oracle(world: SimWorld, name: str, task: Task) -> Iterator[Step]:
     """Follow a target of a world by its true states up to now; calibration, detector and settings are not used."""
+    rig, target = task.rig, task.target
     truth, exact = world.truth(), true_calibration(world, stops=world.config.sim.zoom.lens_steps)
     controller, command = HeadController(rig.head.limits, ORACLE_HEAD), _Commands(rig)
     T_fixed_world, lens = truth.T_world_fixed.inv(), exact.zoom_head.lens
-    for frame, interval in command.frames(seconds):
+    for frame, interval in command.frames(task.seconds):
         now = rig.clock.now()
         before, last, x = (T_fixed_world.apply(truth.center(name, max(now - k * PAST_S, 0.0))) for k in (2, 1, 0))
         velocity, acceleration = (1.5 * x - 2 * last + 0.5 * before) / PAST_S, (x - 2 * last + before) / PAST_S**2

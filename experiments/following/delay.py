@@ -135,5 +135,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = DelaySettings()
-QUICK = dataclasses.replace(SETTINGS, seeds=1, targets=("bird",), delays=(FIELD_S,), seconds=10.0, calibrated=False)
+QUICK = dataclasses.replace(SETTINGS, seeds=1, targets=("bird",), delays=(FIELD_S,), seconds=6.0, calibrated=False)
 COST_S = 250.0

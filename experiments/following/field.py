@@ -22,7 +22,7 @@ from cotarget.detection import Detector, make_detector
 from cotarget.evaluation import add_row, true_calibration
 from cotarget.metrics import BACKGROUND_S
 from cotarget.metrics import Row as Judged
-from cotarget.pipeline import FollowSettings, Step, follow
+from cotarget.pipeline import FollowSettings, Step
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.targets.random_paths import SECONDS, group_paths, lone_path
 from cotarget.sim.truth import Truth
@@ -30,7 +30,7 @@ from cotarget.sim.world import SimWorld
 from experiments.engine import Settings
 from experiments.following.own_rig import OwnRig, RigText, calibrated_rig
 from experiments.following.wide_view import WideView, open_on
-from experiments.paper.paper_loop import Follow
+from experiments.paper.paper_loop import Follow, Task, follow_as_this_project
 
 EXPOSURE_S = 0.01
 LATENCY_S = 0.12  # from light to frame, both cameras
@@ -128,7 +128,7 @@ def watched(
         world, detector = SimWorld(config), make_detector(target, config.sim.fixed.rate_hz)
     else:
         world, detector = open_on(view, config, closed_loop=settings.closed_loop)
-    how = partial(follow, selector=selector)
+    how = partial(follow_as_this_project, selector=selector)
     yield from watched_in(world, detector, calibration, target, seconds, settings, how)
 
 
@@ -139,10 +139,10 @@ def watched_in(
     target: TargetProfile,
     seconds: float,
     settings: FollowSettings,
-    how: Follow = follow,
+    how: Follow = follow_as_this_project,
 ) -> Iterator[tuple[Step, Truth]]:
     """Follow a target in an open world with a given detector and loop; yield each Step with the ground truth."""
     truth = world.truth()
     with guard(world.rig, world.config.safety) as rig:
-        for step in how(rig, calibration, target, detector, seconds=seconds, settings=settings):
+        for step in how(Task(rig, calibration, target, detector, seconds, settings)):
             yield step, truth

@@ -130,5 +130,5 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 SETTINGS = FiveSettings()
-QUICK = dataclasses.replace(SETTINGS, seeds=1, kinds=("person",), seconds=12.0, calibrated=False)
+QUICK = dataclasses.replace(SETTINGS, seeds=1, kinds=("person",), seconds=10.0, calibrated=False)
 COST_S = 250.0

@@ -26,7 +26,7 @@ from cotarget.sim.targets.random_paths import BOOK_MOVED_AT, BOOK_TAKES, lone_pa
 from cotarget.sim.world import SimWorld
 from experiments.engine import Count, Pictured, Row
 from experiments.following.field import OwnRigInField, calibrated
-from experiments.paper.paper_loop import OURS, WAYS, laid_out, picture_name
+from experiments.paper.paper_loop import OURS, WAYS, Task, laid_out, picture_name
 from experiments.tables import grouped, outside, spread
 
 NAME = "book"
@@ -85,7 +85,7 @@ def _shown(
             ends: list[Step] = []
             for wanted, seconds in ((speck, TURN_S), (target, settings.seconds)):
                 detector = make_detector(target, config.sim.fixed.rate_hz)
-                ends += first_and_last(WAYS[way](rig, calibration, wanted, detector, seconds=seconds, settings=how))
+                ends += first_and_last(WAYS[way](Task(rig, calibration, wanted, detector, seconds, how)))
             shown = dict(zip(STAGES, (ends[0], ends[1], ends[3]), strict=True))
             row = {"seed": seed, "place": place, "way": way}
             for stage, step in shown.items():

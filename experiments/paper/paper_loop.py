@@ -8,6 +8,7 @@ things open, which are this project's: the calibration, and the association of c
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.control.controller import reach_of
+from cotarget.control.selection import TargetSelector
 from cotarget.detection import Detector
 from cotarget.drawing import PAPER, captioned
 from cotarget.errors import UnreachableError
@@ -25,33 +27,53 @@ from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
 METHOD: Method = "paper-table"  # depth as in Table 1
-Follow = Callable[..., Iterator[Step]]  # takes the arguments of `follow`
 
 
-def follow_as_the_paper(
-    rig: Rig,
-    calibration: Calibration,
-    target: TargetProfile,
-    detector: Detector,
-    *,
-    seconds: float,
-    settings: FollowSettings,
-) -> Iterator[Step]:
-    """Follow a target by the paper's method; arguments, Steps and errors are those of `follow`.
+@dataclass(frozen=True)
+class Task:
+    """What to follow, with what, and for how long: the arguments of `follow`."""
+
+    rig: Rig
+    calibration: Calibration
+    target: TargetProfile
+    detector: Detector
+    seconds: float
+    settings: FollowSettings
+
+
+Follow = Callable[[Task], Iterator[Step]]  # Steps and errors are those of `follow`
+
+
+def follow_as_this_project(task: Task, selector: TargetSelector | None = None) -> Iterator[Step]:
+    """Follow a target by `follow`, by default the first that comes."""
+    return follow(
+        task.rig,
+        task.calibration,
+        task.target,
+        task.detector,
+        selector=selector,
+        seconds=task.seconds,
+        settings=task.settings,
+    )
+
+
+def follow_as_the_paper(task: Task) -> Iterator[Step]:
+    """Follow a target by the paper's method.
 
     Of the settings only the command delay is used. It distinguishes a head that has stopped from one that has not
     started.
     """
-    calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
+    rig, target = task.rig, task.target
+    calibration = task.calibration.for_streams(rig.fixed.size, rig.zoom.size)
     eyes, tracker = FrameSource(rig.fixed, rig.zoom, rig.clock), Tracker(tracking_settings(target), rig.fixed.size)
     head = rig.head.state()
     commanded = (head.pan, head.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
     mine: Track | None = None
     index, sent, begun = 0, 0, rig.clock.now()  # time at which the last command takes effect [s]
-    end = begun + seconds
+    end = begun + task.seconds
     while rig.clock.now() < end:
         frame = eyes.read_fixed()
-        detections = detector.detect(frame)
+        detections = task.detector.detect(frame)
         tracks = tracker.update(detections.boxes, frame.t)
         zoom = eyes.read_zoom()
         mine = _first(tracks, mine)
@@ -102,7 +124,7 @@ def _aim(calibration: Calibration, target: TargetProfile, track: Track, rig: Rig
         return None
 
 
-WAYS: Mapping[str, Follow] = {"this project": follow, "as the paper": follow_as_the_paper}
+WAYS: Mapping[str, Follow] = {"this project": follow_as_this_project, "as the paper": follow_as_the_paper}
 OURS = "this project"
 
 

@@ -75,7 +75,8 @@ class EmulatedRig(Closes):
     def rig_toml(self) -> Path:
         """Update and return the rig.toml that connects to it; a head that was unplugged returns under another name."""
         tables = tomllib.loads(read_text(self.hardware_toml))
-        tables["hardware"]["head"]["port"] = self.truth()["port"]
+        if "head" in tables["hardware"]:
+            tables["hardware"]["head"]["port"] = self.truth()["port"]
         self.hardware_toml.write_text(tomli_w.dumps(tables), encoding="utf-8")
         return self.hardware_toml
 

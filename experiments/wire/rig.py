@@ -67,9 +67,16 @@ def tapped(clock: Any) -> Iterator[list[Tap]]:
 
 @contextlib.contextmanager
 def beside(serve: Callable[..., None], *arguments: Any) -> Iterator[Any]:
-    """Run a server in another process inside the block; yield its first message.
+    """Run a server in another process inside the block; yield its first message. As `talking`, without the pipe."""
+    with talking(serve, *arguments) as (said, _):
+        yield said
 
-    The server gets a pipe and the arguments, sends its address, and ends when it receives something.
+
+@contextlib.contextmanager
+def talking(serve: Callable[..., None], *arguments: Any) -> Iterator[tuple[Any, Connection]]:
+    """Run a server in another process inside the block; yield its first message and the pipe to it.
+
+    The server gets a pipe and the arguments, sends its address, and ends when it receives None.
 
     Raises:
         DeviceError: the process ended without a message.
@@ -84,7 +91,7 @@ def beside(serve: Callable[..., None], *arguments: Any) -> Iterator[Any]:
             said = ours.recv()
         except EOFError:
             raise DeviceError("an emulated device did not start") from None
-        yield said
+        yield said, ours
     finally:
         with contextlib.suppress(OSError):
             ours.send(None)

@@ -6,6 +6,7 @@
 - faults: time from each fault of the emulated devices to a standing head, or to recovery.
 - latency: latencies of cameras and commands as measured at bring-up, against the emulator's truth.
 - parity: final pose of the head, the simulation opened directly and over the wire.
+- follow: close-up yield of a person who is followed through a dome, over that of the simulation with the same rates.
 
 All run in real time beside the emulator, which needs its own core. On a busy machine the figures include its load.
 """
@@ -24,7 +25,7 @@ from cotarget.schema import Positive
 from experiments.engine import Count, Row, Settings
 from experiments.report import compare
 from experiments.tables import grouped
-from experiments.wire import age, command, latency, parity, polls
+from experiments.wire import age, command, follow, latency, parity, polls
 from experiments.wire import faults as faults_module
 
 NEVER = (0.0, 0.0)  # bound of what must never happen, on any machine: hanging, or moving beyond the limits
@@ -35,6 +36,7 @@ BEYOND_MS = 25.0  # limit of p95 of a command, detection excluded
 SETTLED_S = 0.5  # limit of the time from a fault to a standing head, or to recovery
 LATENCY_MS = 10.0
 PARITY_STEPS = 1.0
+FOLLOWED = 0.95  # least close-up yield over the wire, over that of the simulation
 ROUNDING = 1e-6  # rounding of steps that were converted to angles
 PARTS = ("in_hand", "detection", "aiming", "line", "total", "beyond")
 PART_COLUMNS = ("median [ms]", "p95 [ms]", "max [ms]")
@@ -50,7 +52,8 @@ Figure = dict[str, Any]
 class WireSettings(Settings):
     """Settings: figures and durations of their measurement."""
 
-    only: tuple[str, ...] = ("polls", "age", "command", "faults", "latency", "parity")  # figures to measure
+    # Figures to measure.
+    only: tuple[str, ...] = ("polls", "age", "command", "faults", "latency", "parity", "follow")
     poll_s: Positive = 10.0  # polling of one unit [s]
     age_s: Positive = 30.0  # reading of the stream [s]
     targets: tuple[str, ...] = ("book", "person")  # targets that are followed to time commands
@@ -61,6 +64,9 @@ class WireSettings(Settings):
     swing_s: Positive = 10.0  # swinging of the board [s]
     places: Count = 2  # places of the static book
     still_s: Positive = 6.0  # following at each place [s]
+    dome: str = "visca"  # protocol of the dome
+    units: str = "ptzoptics"  # of the dome
+    follow_s: Positive = 30.0  # following of the person [s]
     tries: Count = 1  # largest number of measurements of a figure that a busy machine has disturbed
 
     def __post_init__(self) -> None:
@@ -100,6 +106,7 @@ RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
     ),
     "latency": lambda s, folder: latency.run(folder, s.wiggle_s, s.swing_s),
     "parity": lambda s, folder: parity.run(folder, s.places, s.still_s, s.seed_base),
+    "follow": lambda s, folder: follow.run(folder, s.dome, s.units, s.follow_s, s.seed_base),
 }
 
 
@@ -126,6 +133,9 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     if places := of.get("parity"):
         apart = max(max(row["pan_steps"], row["tilt_steps"]) for row in places)
         figures["parity, farthest apart"] = at_most(round(apart / ROUNDING) * ROUNDING, PARITY_STEPS, "steps")
+    for row in of.get("follow", []):
+        name = f"follow, {row['dome']}: yield {row['wire']:.3f} for {row['sim']:.3f} in the simulation"
+        figures[name] = at_least(row["wire"] / row["sim"], FOLLOWED, "of it")
     loads = [row["load"] for row in rows]
     return {
         "figures": figures,
@@ -144,7 +154,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 def bounded(summary: Mapping[str, Any]) -> dict[str, float]:
     """Give the measured values by names without values."""
     return {
-        name.partition(":")[0] if name.startswith("latency") else name: figure["measured"]
+        name.partition(":")[0] if name.startswith(("latency", "follow")) else name: figure["measured"]
         for name, figure in summary["figures"].items()
     }
 
@@ -220,8 +230,9 @@ def _of_faults(faults: dict[str, dict[str, Any]]) -> dict[str, Figure]:
 SETTINGS = WireSettings(seeds=1)
 QUICK = replace(
     SETTINGS,
+    only=SETTINGS.only[:-1],  # a test follows through a dome
     poll_s=2.0,
-    age_s=6.0,
+    age_s=4.0,
     targets=("book",),
     command_s=6.0,
     faults=("head.silence", "fixed.stall"),

@@ -48,7 +48,8 @@ def test_the_drawn_board_starts_at_its_first_corner_with_a_black_square(corners)
     assert np.abs(found - expected).max() < CORNER_TOLERANCE_PX
 
 
-LARGER = [(6, 5), (7, 4), *(pytest.param(it, marks=pytest.mark.slow) for it in ((8, 5), (9, 4), (10, 7), (9, 8)))]
+MORE = ((7, 4), (8, 5), (9, 4), (10, 7), (9, 8))
+LARGER = [(6, 5), *(pytest.param(it, marks=pytest.mark.slow) for it in MORE)]
 
 
 @pytest.mark.parametrize("corners", LARGER)

@@ -306,6 +306,10 @@ size = [320, 240]
 [sim.zoom]
 rate_hz = 12.5
 size = [320, 240]
+[sim.effects]
+noise = false
+jpeg = false
+blur = false
 [targets.book]
 wanted_px = 80
 """

@@ -249,8 +249,11 @@ run(2)
 
 
 @pytest.mark.wire
-@pytest.mark.parametrize("where", [IN_THREADS, IN_BOTH], ids=["threads", "a thread and the main thread"])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGTSTP])
+@pytest.mark.parametrize(("where", "number"), [
+    pytest.param(IN_THREADS, signal.SIGTERM, id="threads"),
+    pytest.param(IN_BOTH, signal.SIGINT, id="a thread and the main thread"),
+    pytest.param(IN_BOTH, signal.SIGTSTP, id="suspended"),
+])  # fmt: skip
 def test_a_signal_halts_the_heads_of_all_threads(start, where, number):
     child = start(TWO_RIGS + where)
     for rig in "12":

@@ -17,7 +17,8 @@ def limits_are_ascending_and_positive(head, clock):
     limits = head.limits
     assert limits.pan.range[0] < limits.pan.range[1]
     assert limits.tilt.range[0] < limits.tilt.range[1]
-    assert min(limits.pan.speed, limits.pan.acceleration) > 0
+    assert limits.pan.speed > 0
+    assert limits.pan.acceleration is None or limits.pan.acceleration > 0
     assert limits.pan.step >= 0
 
 

@@ -21,6 +21,7 @@ from cotarget.drivers import axis, frame_buffer
 from cotarget.drivers.axis import AxisCamera, AxisSettings, LoginError
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
+from tests.support.loopback import Loopback
 from tests.support.plants import FEED_SIZE, PASSWORD, USER, axis_server, wait_for
 
 pytestmark = pytest.mark.wire
@@ -104,10 +105,8 @@ class Handler(socketserver.StreamRequestHandler):
             viewer.over.wait(HANG_S)
 
 
-class Script(socketserver.ThreadingTCPServer):
+class Script(Loopback, socketserver.ThreadingTCPServer):
     """A server on loopback: what it answers by path, and the streams that were opened."""
-
-    daemon_threads = False  # so that closing waits for them
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)
@@ -117,10 +116,14 @@ class Script(socketserver.ThreadingTCPServer):
             STATUS: lambda request: reply(body=f"Video {request.query['status']} = video\n".encode()),
             VIDEO: lambda _: STREAM + part(jpeg(0)),
         }
-        self.requests, self.viewers, self.all, self.closing = [], queue.Queue(), [], threading.Event()
+        self.requests, self.viewers, self.all = [], queue.Queue(), []
 
     def viewer(self):
         return self.viewers.get(timeout=PATIENCE_S)
+
+    def cut(self):
+        for viewer in self.all:
+            viewer.cut()
 
 
 def ended(thread):
@@ -132,14 +135,7 @@ def ended(thread):
 @pytest.fixture
 def server():
     with Script() as script:
-        thread = threading.Thread(target=script.serve_forever, args=(0.01,))
-        thread.start()
         yield script
-        script.closing.set()
-        for viewer in script.all:
-            viewer.cut()
-        script.shutdown()
-        ended(thread)
 
 
 @pytest.fixture(autouse=True)

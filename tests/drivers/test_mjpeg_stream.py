@@ -166,7 +166,7 @@ BOUNDARIES = st.sampled_from(["myboundary", "other", None])
 
 
 # The same examples in every run, whatever the machine's speed, and no files beside the tests.
-@settings(derandomize=True, database=None, deadline=None, max_examples=800)
+@settings(derandomize=True, database=None, deadline=None, max_examples=300)
 @given(st.lists(st.sampled_from(CRUMBS) | st.binary(max_size=9), max_size=8), CUTS, BOUNDARIES)
 def test_how_a_stream_is_cut_into_pieces_does_not_matter(crumbs, cuts, boundary):
     stream = b"".join(crumbs)

@@ -274,5 +274,5 @@ def test_a_driver_is_imported_without_its_devices_library():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    specs = ["CameraSpec", "CameraSpec", "ZoomSpec", "HeadSpec"]
+    specs = ["CameraSpec", "CameraSpec", "ZoomSpec", "HeadSpec", "UnitSpec", "UnitSpec"]
     assert [line.partition("(")[0] for line in done.stdout.splitlines()] == specs

@@ -159,7 +159,7 @@ def mutated(draw):
     return bytes(line)
 
 
-@settings(derandomize=True, database=None, deadline=None, max_examples=1000)
+@settings(derandomize=True, database=None, deadline=None, max_examples=300)
 @given(mutated())
 def test_any_line_is_parsed_or_refused_and_a_bare_integer_equals_its_bytes(line):
     assert set(ptu_protocol.split_events(line)[1]) <= {"P", "T", "D"}

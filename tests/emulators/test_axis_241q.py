@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.emulators.axis_241q import Authenticator, AxisServer, HttpError, Pace, list_parameters, parse_options
+from cotarget.emulators.authentication import Authenticator
+from cotarget.emulators.axis_241q import AxisServer, HttpError, Pace, list_parameters, parse_options
 from cotarget.emulators.plant import Feed
 from tests.support.emulated_camera import DEADLINE_S, plain, publish
 from tests.support.plants import decoded, wait_for

@@ -361,7 +361,7 @@ def test_an_absent_camera_comes_back_in_play_mode(server, fault, zoom):
         assert camera.ask(0x1015, ZOOM) == (OK, struct.pack("<H", zoom))
 
 
-PROPERTY = settings(derandomize=True, database=None, deadline=None, max_examples=500)
+PROPERTY = settings(derandomize=True, database=None, deadline=None, max_examples=200)
 GUID = bytes(range(16))
 SET, ECHO = 0x1016, 0x9999  # operations
 

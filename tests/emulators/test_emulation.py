@@ -1,5 +1,6 @@
 """The emulated world in simulated and real time, and `cotarget emulate` with the rig.toml that it writes."""
 
+import contextlib
 import json
 import math
 import socket
@@ -13,6 +14,8 @@ import pytest
 
 from cotarget.backends import load_config
 from cotarget.config import RigConfig, SimConfig, parse_config
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.rig import device_of
 from cotarget.emulators.emulation import Emulation
 from cotarget.emulators.serve import JsonLines
 from cotarget.emulators.world import FIXED_HZ, ZOOM_HZ, EmulatedAxis, LiveWorld, paced
@@ -24,6 +27,7 @@ from tests.support.emulated_camera import DEADLINE_S
 from tests.support.plants import fails
 from tests.support.simulated_clock import SimClock
 
+TIME_S = 0.02  # of the median time of a picture, whose encoding takes longer on a busy machine
 STEP = math.radians(0.05)  # [rad]
 DELAY = 0.04  # from a command to motion [s]
 
@@ -262,7 +266,29 @@ def test_the_written_rig_describes_the_emulated_devices():
     assert all("error" in answer for answer in (wrong_fault, wrong_device, no_object, *wrong))
 
 
-@pytest.mark.parametrize("sim", [{"zoom": {"size": [641, 480]}}, {"head": {"step_deg": 1e-5}}])
+@pytest.mark.wire
+@pytest.mark.render
+def test_the_fixed_camera_behind_rtsp_has_the_pictures_times(monkeypatch):
+    monkeypatch.setenv("COTARGET_PASSWORD", "pass word")
+    config = paced(parse_config({"sim": {"scene": "indoor"}}))
+    with Emulation(config, user="viewer", password="pass word", fixed="rtsp") as emulation:
+        table = tomllib.loads(emulation.rig_toml(tcp=True))["hardware"]["fixed"]
+        assert (table["driver"], table["url"], table["user"]) == ("stream", emulation.fixed.url, "viewer")
+        clock = MonotonicClock()
+        with contextlib.closing(device_of("fixed", table).open(clock)) as camera:
+            frames = [camera.read(timeout=DEADLINE_S)]
+            while len(frames) < 20:
+                frames.append(camera.read(frames[-1].t, DEADLINE_S))
+            begin = emulation.world.clock.monotonic(0.0) + clock.now() - time.monotonic()
+    periods = (np.array([frame.t for frame in frames[10:]]) - begin) * config.sim.fixed.rate_hz
+    assert np.median(np.abs(periods - np.round(periods))) < TIME_S * config.sim.fixed.rate_hz
+    with pytest.raises(ConfigError, match=r"unknown fault 'fixed\.dashed-boundary'"):
+        emulation.switch("fixed.dashed-boundary")
+
+
+@pytest.mark.parametrize(
+    "sim", [{"zoom": {"size": [641, 480]}}, {"head": {"step_deg": 1e-5}}, {"fixed": {"size": [641, 480]}}]
+)
 def test_a_rig_that_these_devices_cannot_have_is_refused(sim):
     with pytest.raises(ConfigError):
-        Emulation(parse_config({"sim": sim}))
+        Emulation(parse_config({"sim": sim}), fixed="rtsp")

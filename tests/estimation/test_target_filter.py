@@ -154,7 +154,7 @@ def test_any_permutation_of_the_measurements_gives_the_same_estimate(kind):
     every = measurements(flight)
     assert {each[0] for each in every} > set(flight.times)  # both cameras measure
     rng, estimates = np.random.default_rng(0), []
-    for order in (range(len(every)), range(len(every))[::-1], *(rng.permutation(len(every)) for _ in range(4))):
+    for order in (range(len(every)), range(len(every))[::-1], *(rng.permutation(len(every)) for _ in range(2))):
         estimator = TargetFilter(flight.calibration, flight.target)
         for i in order:
             assert every[i][1](estimator)
@@ -453,7 +453,7 @@ class Approach:
         return Detections([self.box(FIXED, frame.t)])
 
 
-@pytest.mark.parametrize("speed", [0.5, 1.4, 3.0, 10.0])
+@pytest.mark.parametrize("speed", [0.5, 10.0])
 @pytest.mark.parametrize("name", WAYS)
 def test_the_depth_of_a_target_clipped_for_a_minute_stays_bounded(name, speed):
     lens, way = Truth().fixed, Approach(name, speed)

@@ -42,10 +42,10 @@ def test_ahead_is_a_difference_whose_interval_is_above_nothing():
     assert set(found[OURS]) == {"closeup_yield", "centred_yield"}
 
 
-@pytest.mark.parametrize("name", DEFAULT_TARGETS)
-def test_the_oracle_centres_a_target_of_the_field(name):
+def test_the_oracle_centres_a_target_of_the_field():
+    """A book; the quick run of hold has bounds for a person and a bird."""
     settings = dataclasses.replace(hold.SETTINGS, seconds=4.0, calibrated=False)
-    ((way, found),) = scores(settings, hold_config(name, 3), name, [ORACLE])
+    ((way, found),) = scores(settings, hold_config("book", 3), "book", [ORACLE])
     assert way == ORACLE
     assert found.closeup_yield > 0.95
     assert found.centred_yield > 0.95

@@ -26,7 +26,7 @@ from experiments.following.field import calibrated
 from experiments.paper import fig4_book, table2_table3, worked_example
 from experiments.paper.fig6_outdoors import Moment, figures
 from experiments.paper.gallery import PICTURES, SHOWN, WIDEST_PX, main
-from experiments.paper.paper_loop import follow_as_the_paper
+from experiments.paper.paper_loop import Task, follow_as_the_paper
 
 ROUNDING = 1e-9  # relative, or of millimetres of ten metres
 
@@ -146,7 +146,7 @@ def run():
     detector = TruthDetector(world.truth(), 0, TruthNoise(0.0, 0.0, 0.0))
     known, how = true_calibration(world), FollowSettings()
     with world.rig as rig:
-        steps = list(follow_as_the_paper(rig, known, config.target("person"), detector, seconds=6.0, settings=how))
+        steps = list(follow_as_the_paper(Task(rig, known, config.target("person"), detector, 6.0, how)))
     return known, steps
 
 

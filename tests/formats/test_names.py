@@ -317,11 +317,14 @@ def test_the_emulator_writes_and_answers_what_is_listed(old):
     assert address["head"] == f"{config.hardware.head['port']} and {address['head'].split()[-1]}"
 
 
-@pytest.mark.parametrize("device", ["head", "fixed", "zoom"])
-def test_the_emulated_devices_have_the_listed_faults(device, tmp_path, capsys):
-    assert main(["emulate", "--write", str(tmp_path / "rig.toml"), "--fault", f"{device}.{UNKNOWN}"]) == 1
+@pytest.mark.parametrize(("device", "begins", "options"), [
+    ("head", "fault", []), ("fixed", "fault", []), ("zoom", "fault", []), ("fixed", "rtsp", ["--fixed", "rtsp"]),
+    ("ptz", "onvif", ["--ptz", "onvif"]), ("ptz", "visca", ["--ptz", "visca"]),
+])  # fmt: skip
+def test_the_emulated_devices_have_the_listed_faults(device, begins, options, tmp_path, capsys):
+    assert main(["emulate", "--write", str(tmp_path / "rig.toml"), "--fault", f"{device}.{UNKNOWN}", *options]) == 1
     names = last_list(capsys.readouterr().err.strip())
-    begins = f"fault {device}."
+    begins = f"{begins} {device}."
     assert_listed("emulation.txt", {f"{begins}{name}" for name in names}, begins=begins)
 
 

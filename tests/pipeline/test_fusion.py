@@ -106,6 +106,22 @@ def test_a_track_has_an_estimate_as_long_as_it_lives():
     assert fusion.estimate(2, t) is not None
 
 
+def test_a_nudge_of_the_fixed_camera_moves_no_target():
+    """It is turned to the right by 20 px: all that it shows moves to the left."""
+    fusion, shift = Pair(BOOK), np.array([-20.0, 0.0])
+    assert fusion.fusion.warnings() == []
+    t = seen(fusion, lambda t: [track(1, box_at(0.0, 0.5, 10.0), t)], 10)
+    moved = box_at(0.0, 0.5, 10.0)
+    fusion.fusion.add_shift(shift, cut=False)
+    fusion.show(t + FRAME_S, [track(1, replace(moved, center_px=moved.center_px + shift), t + FRAME_S)])
+    np.testing.assert_allclose(fusion.estimate(1, t + FRAME_S).x_fixed, (0.0, 0.5, 10.0), rtol=0.02, atol=0.01)
+    assert "turned by 2 degrees" in fusion.fusion.warnings()[0]  # 20 / 700
+    fusion.fusion.add_shift(None, cut=False)
+    assert "turned by 2 degrees" in fusion.fusion.warnings()[0]
+    fusion.fusion.add_shift(shift, cut=True)
+    assert "calibrate again" in fusion.fusion.warnings()[0]
+
+
 def test_a_missed_track_measures_nothing():
     """Its box is an old one, at another place."""
     fusion = Pair(BOOK)

@@ -68,6 +68,15 @@ def test_a_rolled_camera_sees_the_own_length_of_an_ellipse(dimension, shape, rol
     assert profile.turn(shape, 1.0, roll) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_a_stride_is_no_roll():
+    """The head leans by a degree; a walker's box is half as wide again with each step."""
+    assert [DEFAULT_TARGETS["person"].turn(width, 1.0, math.radians(1)) for width in (0.35, 0.4, 0.6)] == [
+        0.0,
+        0.0,
+        0.0,
+    ]
+
+
 def test_without_a_usual_shape_the_nearest_side_is_the_length():
     profile = replace(CAR, dimension="height")
     assert [profile.length(3.0, 1.0, math.radians(roll)) for roll in (0, 30, 60, 90)] == [1.0, 1.0, 3.0, 3.0]

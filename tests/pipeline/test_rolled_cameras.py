@@ -16,11 +16,13 @@ ROLLS = [0, 30, 90, 180, -90]
 # Distortion and the principal point, off the image's centre, show a rolled target elsewhere in the lens.
 SAME_SIZE = 0.02
 SEED, SECONDS = 3, 6.0
+# All rolls are those of the size alone, below; without roll a target is held in the quick run of hold.
 CASES = [
-    *(("person", camera, roll) for camera in ("fixed", "zoom") for roll in ROLLS[1:]),
-    *(("bird", camera, roll) for camera in ("fixed", "zoom") for roll in (30, 90)),
-    ("person", "zoom", 0), ("bird", "zoom", 0),
-]  # fmt: skip
+    *(("person", camera, 90) for camera in ("fixed", "zoom")),
+    *(("bird", camera, 30) for camera in ("fixed", "zoom")),
+    ("person", "zoom", -90),
+    ("person", "fixed", 180),
+]
 # Least yields, with detections from ground truth and without closed loop. Without roll they are .92 and .80; the least
 # of the others, .88 and .68.
 LEAST = {"person": 0.85, "bird": 0.65}

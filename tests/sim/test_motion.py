@@ -14,7 +14,7 @@ from cotarget.sim.motion import HISTORY_S, Axis, trapezoid
 from cotarget.sim.world import SimWorld
 
 ROUNDING = 1e-9
-AGED = 1.05  # memory after ten minutes over that after two; the history's length varies by a command or two
+AGED = 1.05  # memory after six minutes over that after two; the history's length varies by a command or two
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -173,14 +173,14 @@ def test_an_axis_that_forgets_stands_where_one_that_remembers_stands(limits, mon
 
 
 def test_the_memory_of_an_axis_does_not_grow_with_its_age():
-    """Commands and readings at 25 Hz, for two minutes and for ten."""
+    """Commands and readings at 25 Hz, for two minutes and for six."""
     axis, held = Axis(1.0, 10.0, backlash=0.01), []
     tracemalloc.start()
     try:
-        for i in range(10 * 60 * 25):
+        for i in range(6 * 60 * 25):
             axis.command(i / 25 + 0.04, float(i % 2))
             axis.driven(i / 25)
-            if i in (2 * 60 * 25, 10 * 60 * 25 - 1):
+            if i in (2 * 60 * 25, 6 * 60 * 25 - 1):
                 held.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()

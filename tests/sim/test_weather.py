@@ -72,13 +72,12 @@ def test_frames_are_a_function_of_seed_and_time_alone():
 def test_another_seed_gives_another_wind():
     """Noise and the trees are others too: only when the treetops go to and fro tells of the wind."""
     ways = []
-    for seed in (3, 3, 4):
+    for seed in (3, 4):
         with (w := world(seed=seed, effects={"clutter": True})).rig:
             truth = w.truth()
             crowns = [g for g in range(truth.model.ngeom) if truth.model.geom(g).name.startswith("clutter/crown_")]
             ways.append(np.array([truth.set_state(t).geom_xpos[crowns, 0] for t in np.arange(0.0, 20.0, 0.25)]).T)
-    np.testing.assert_array_equal(ways[0], ways[1])
-    alike = [np.corrcoef(one, other)[0, 1] for one, other in zip(ways[0], ways[2], strict=True)]
+    alike = [np.corrcoef(one, other)[0, 1] for one, other in zip(*ways, strict=True)]
     assert max(alike) < ALIKE
 
 

@@ -4,7 +4,9 @@ A way opens its device for the length of a with block, and gives it with its clo
 while it keeps the promise, and then has to keep it in the replay.
 """
 
+import atexit
 import contextlib
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -25,7 +27,7 @@ from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
 from tests.support.gphoto_link import CONFIG as GPHOTO_CONFIG
 from tests.support.gphoto_link import FakeLink
-from tests.support.plants import FEED_SIZE, PASSWORD, USER, D46Unit, axis_server, s5is_process
+from tests.support.plants import FEED_SIZE, PASSWORD, USER, D46Unit, LiveDome, axis_server, s5is_process
 from tests.support.recorded_run import calibration_file
 from tests.support.rtsp_server import Feed, RtspServer
 
@@ -102,12 +104,17 @@ def rtsp():
             yield camera, MonotonicClock()
 
 
+@functools.cache
+def s5is_port():
+    """An emulated S5 IS for all promises, because its process takes a second to start; its port."""
+    kept = contextlib.ExitStack()
+    atexit.register(kept.close)
+    return kept.enter_context(s5is_process()).port
+
+
 @contextlib.contextmanager
 def s5is():
-    with (
-        s5is_process() as process,
-        contextlib.closing(GphotoCamera(GphotoSettings(port=process.port), MonotonicClock())) as camera,
-    ):
+    with contextlib.closing(GphotoCamera(GphotoSettings(port=s5is_port()), MonotonicClock())) as camera:
         yield camera, MonotonicClock()
 
 
@@ -125,13 +132,24 @@ def d46(tcp=False):
         yield head, MonotonicClock()
 
 
+@contextlib.contextmanager
+def dome(part):
+    with LiveDome() as live, contextlib.closing(live.open()) as opened:
+        device = getattr(opened, part)
+        if part == "zoom":
+            device.close = opened.close  # of the whole
+        yield device, MonotonicClock()
+
+
 WIRE = pytest.mark.wire
 ZOOM_CAMERAS = [*of_rigs("zoom"), way("gphoto2", gphoto2), way("emulated S5 IS", s5is, WIRE)]
+ZOOM_CAMERAS += [way("emulated VISCA dome", lambda: dome("zoom"), WIRE)]
 CAMERAS = [*of_rigs("fixed"), *ZOOM_CAMERAS, way("emulated 241Q", axis, WIRE), way("RTSP", rtsp, WIRE)]
 HEADS = [
     *of_rigs("head"),
     way("emulated PTU-D46", d46, WIRE),
     way("emulated PTU-D46 by TCP", lambda: d46(tcp=True), WIRE),
+    way("emulated VISCA dome", lambda: dome("head"), WIRE),
 ]
 
 

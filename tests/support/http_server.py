@@ -4,12 +4,13 @@ import base64
 import contextlib
 import http.server
 import io
-import threading
 from fractions import Fraction
 
 import av
 import cv2
 import numpy as np
+
+from tests.support.loopback import Loopback
 
 SIZE, RATE_HZ = (320, 240), 25
 USER, PASSWORD = "viewer", "hunter2 & co"
@@ -75,7 +76,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         pass
 
 
-class HttpServer(http.server.ThreadingHTTPServer):
+class HttpServer(Loopback, http.server.ThreadingHTTPServer):
     """Serves the pages; a context manager.
 
     Attributes:
@@ -90,22 +91,10 @@ class HttpServer(http.server.ThreadingHTTPServer):
         b"a=rtpmap:96 H264/90000\r\n",
         "html": b"<html><body>Log in</body></html>",
     }
-    daemon_threads = False  # so that closing waits for them
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), _Handler)
-        self.asked, self.visited, self.closing = [], [], threading.Event()
+        self.asked, self.visited = [], []
 
     def url(self, page):
         return f"http://127.0.0.1:{self.server_address[1]}/{page}"
-
-    def __enter__(self):
-        self._thread = threading.Thread(target=self.serve_forever, args=(0.01,))
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self.closing.set()
-        self.shutdown()
-        self._thread.join()
-        self.server_close()

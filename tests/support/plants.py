@@ -13,12 +13,15 @@ import numpy as np
 import pytest
 import serial
 
+from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.ptu_d46 import D46Settings
+from cotarget.drivers.visca import ViscaDome, ViscaSettings
 from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.ports import UnitPorts
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.emulators.serve import Faults
+from cotarget.emulators.visca import UNITS, VISCA_FAULTS, ViscaCamera, ViscaModel, ViscaServer
 from cotarget.emulators.world import EmulatedAxis
 from cotarget.errors import DeviceError
 from cotarget.sim.motion import Axis
@@ -119,6 +122,68 @@ def axis_server(auth="digest"):
 
     with Film(draw) as film, AxisServer({1: film.feed}, user=USER, password=PASSWORD, auth=auth) as server:
         yield server
+
+
+# The dome: its pictures come from the video server
+
+
+class TravellingLens:
+    """A lens that takes half a second for its range; a `LensPlant`."""
+
+    last = 0x4000
+
+    def __init__(self):
+        self._axis = Axis(2.0 * self.last, 1e9)
+
+    def command(self, position):
+        self._axis.command(time.monotonic(), position)
+
+    def position(self):
+        return round(self._axis.motor(time.monotonic())[0])
+
+
+class LiveDome:
+    """A camera that takes VISCA, on the machine's own clock, with a stream; a context manager.
+
+    Args:
+        units: those of the camera, and of the settings that connect to it.
+        protocol: how it is reached, in the settings.
+        network: arguments of `ViscaServer`.
+    """
+
+    def __init__(self, units="ptzoptics", protocol="sony", **network):
+        self.pan, self.tilt, self.lens, self.faults = AxisModel(), AxisModel(), TravellingLens(), Faults(VISCA_FAULTS)
+        self.units, self.protocol = units, protocol
+        count_deg, speeds = UNITS[units]
+        pan, tilt = ((round(low / count_deg), round(high / count_deg)) for low, high in ((-170, 170), (-30, 90)))
+        model = ViscaModel(count_deg, speeds, pan, tilt)
+        self.camera = ViscaCamera(self.pan, self.tilt, self.lens, model, self.faults)
+        self._network, self._opened = network, contextlib.ExitStack()
+
+    def __enter__(self):
+        self.server = self._opened.enter_context(ViscaServer(self.camera, self.faults, **self._network))
+        self.stream = self._opened.enter_context(axis_server("basic"))
+        return self
+
+    def __exit__(self, *_):
+        self._opened.close()
+
+    def settings(self, **more):
+        port = self.server.ports[("sony", "udp", "tcp").index(self.protocol)]
+        own = {"host": "127.0.0.1", "port": port, "protocol": self.protocol, "units": self.units}
+        own |= {"url": f"{self.stream.url}/mjpg/video.mjpg", "user": USER, "password": PASSWORD, "size": FEED_SIZE}
+        return ViscaSettings(**own | {"rate_hz": 25.0, "latency_s": 0.0} | more)
+
+    def open(self, **more):
+        """Open it by the driver."""
+        return ViscaDome(self.settings(**more), MonotonicClock())
+
+    def at(self):
+        """Where pan and tilt are [counts]."""
+        return self.pan.position(), self.tilt.position()
+
+    def turning(self):
+        return self.pan.moving() or self.tilt.moving()
 
 
 # The Canon PowerShot S5 IS: in a process of its own, because libgphoto2 would hold up its threads

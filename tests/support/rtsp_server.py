@@ -5,12 +5,13 @@ import hashlib
 import re
 import socket
 import socketserver
-import threading
 import time
 from dataclasses import dataclass, field
 from fractions import Fraction
 
 import av
+
+from tests.support.loopback import Loopback
 
 USER, PASSWORD = "viewer", "hunter2 & co"
 REALM, NONCE = "camera", "f00d"
@@ -193,7 +194,7 @@ def _is_authorized(header, method):
     return said.get("username") == USER and said.get("response") == wanted
 
 
-class RtspServer(socketserver.ThreadingTCPServer):
+class RtspServer(Loopback, socketserver.ThreadingTCPServer):
     """Serves a feed to any number of clients; a context manager.
 
     Attributes:
@@ -203,13 +204,12 @@ class RtspServer(socketserver.ThreadingTCPServer):
         sent: time at which each image's packet was sent [s], by index.
     """
 
-    daemon_threads = False  # so that closing waits for them
     allow_reuse_address = True
 
     def __init__(self, feed):
         super().__init__(("127.0.0.1", 0), _Session)
         self.feed, self.url = feed, f"rtsp://127.0.0.1:{self.server_address[1]}/live"
-        self.requests, self.sent, self.closing = [], {}, threading.Event()
+        self.requests, self.sent = [], {}
         self._clients = []
 
     def process_request(self, request, client_address):
@@ -222,15 +222,3 @@ class RtspServer(socketserver.ThreadingTCPServer):
             with contextlib.suppress(OSError):
                 client.shutdown(2)
         self._clients.clear()
-
-    def __enter__(self):
-        self._thread = threading.Thread(target=self.serve_forever, args=(0.01,))
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self.closing.set()
-        self.shutdown()
-        self.cut()
-        self._thread.join()
-        self.server_close()

@@ -112,7 +112,6 @@ class SyntheticRig:
     board_config: BoardConfig = field(default_factory=BoardConfig)
     seed: int = 0
     noise: float = 2.0
-    stuck: bool = False
     frozen_camera: bool = False
     short_of: float = 0.0
     halts: int = 0
@@ -229,11 +228,10 @@ class _Head:
             float(np.clip(np.round(q / step) * step, *limit))
             for q, limit in ((pan, rig.limits.pan.range), (tilt, rig.limits.tilt.range))
         )
-        if not rig.stuck:
-            rig.arrives = rig.t + 0.3
-            rig.pose = (wanted[0] * (1 - rig.short_of), wanted[1])
-            if rig.halts:
-                rig.pose, rig.halts = (wanted[0] / 2, wanted[1] / 2), rig.halts - 1
+        rig.arrives = rig.t + 0.3
+        rig.pose = (wanted[0] * (1 - rig.short_of), wanted[1])
+        if rig.halts:
+            rig.pose, rig.halts = (wanted[0] / 2, wanted[1] / 2), rig.halts - 1
         if wait:
             rig.t = max(rig.t, rig.arrives)
         return wanted

@@ -1,5 +1,7 @@
 """Estimate the shift of the fixed camera's image since the first frame, by tracked corners."""
 
+import math
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -28,8 +30,8 @@ FOUND_AGAIN, FEWEST_ALIKE = 0.3, 0.35
 # Fewest corners that stand and look the same, by this mean difference [grey levels], where the film goes on: a large
 # target before plain ground has the others. After a cut none do, but those of writing.
 FEWEST_STANDING, SAME_PLACE = 5, 12.0
-# Frames after which corners are detected again, because some have drifted off and some are on a target.
-RENEW_FRAMES = 15
+# Time after which corners are detected again, because some have drifted off and some are on a target [s].
+RENEW_S = 0.5
 # Window in which a corner is tracked, and pyramid levels: up to 20 px a frame of the full image.
 WINDOW_PX, LEVELS = (11, 11), 2
 # Largest difference of a corner's shift from the common one, along each axis [px].
@@ -51,15 +53,16 @@ class CameraMotion:
         self._last: Image | None = None
         self._corners = self._first = np.zeros((0, 1, 2), np.float32)  # now, and where each was detected
         self._before = np.zeros(2)  # shift of the image in which they were detected
-        self._age = RENEW_FRAMES
+        self._t = self._begun_t = -math.inf  # times of the last image, and of that in which they were detected
         self._shift = np.zeros(2)
         self.jumped = False
 
-    def update(self, grey: Image) -> Array:
+    def update(self, grey: Image, t: float) -> Array:
         """Update the shift with the next frame.
 
         Args:
             grey: image, (H, W).
+            t: its time [s].
 
         Returns:
             Shift (du, dv) of the scene since the first frame [px], (2,).
@@ -68,7 +71,7 @@ class CameraMotion:
         half = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         if self._last is not None:
             self._step(self._last, half)
-        self._last = half
+        self._last, self._t = half, t
         return self._shift
 
     def _step(self, before: Image, after: Image) -> None:
@@ -78,10 +81,9 @@ class CameraMotion:
         pixel a frame, are then distinguished from the scene, and their drift does not add up.
         """
         self.jumped = False
-        self._age += 1
-        if self._age >= RENEW_FRAMES:
+        if not 0 <= self._t - self._begun_t < RENEW_S:
             self._begin(_corners(before))
-            self._age = 0
+            self._begun_t = self._t
         if len(self._corners) < FEWEST or _spread(self._corners, before) < SPREAD:
             # A film that goes on in another place: where there was sky alone, there are many corners at once.
             come = _corners(after)
@@ -103,7 +105,7 @@ class CameraMotion:
             alike = standing
         if kept.mean() < FOUND_AGAIN or alike.sum() < fewest:
             as_before = kept & _alike(flow, np.zeros(2)) & (error.ravel() < SAME_PLACE)
-            self.jumped, self._age = as_before.sum() < FEWEST_STANDING, RENEW_FRAMES
+            self.jumped, self._begun_t = as_before.sum() < FEWEST_STANDING, -math.inf
             return
         way = (ahead - self._first).reshape(-1, 2)[alike]
         self._corners, self._first = ahead[kept], self._first[kept]

@@ -45,11 +45,6 @@ class History:
         """Time between the oldest and the newest image [s]."""
         return self._kept[-1][0] - self._kept[0][0] if self._kept else 0.0
 
-    @property
-    def kept_last(self) -> bool:
-        """Whether the last image was kept: it came at least SPACING_S after the one kept before."""
-        return bool(self._kept) and self._kept[-1][1] is self._last
-
     def add(self, t: float, grey: Image, shift: Array, exposure: float = 1.0) -> bool:
         """Add an image; restart if its time jumped back or far ahead, and drop images of another exposure.
 

@@ -43,9 +43,9 @@ FEWEST_EARLIER = 3
 # Shift of the camera between two images up to which they are subtracted as they are, and up to which after they are
 # registered [px].
 STANDING_PX, SHAKING_PX = 0.5, 5.0
-# Usual difference, such as of a swaying branch, subtracted from the difference: its factor, the weight of the newest
-# image that is kept in its mean, and the width over which it spreads [px].
-USUAL_TIMES, USUAL_GAIN, SWAY_PX = 3.0, 0.02, 5
+# Usual difference, such as of a swaying branch, subtracted from the difference: its factor, the time constant of its
+# mean [s], and the width over which it spreads [px].
+USUAL_TIMES, USUAL_S, SWAY_PX = 3.0, 2.0, 5
 # Largest score of a clipped box, which may continue a track but not begin one: half of its surroundings are outside the
 # image, so a swaying twig looks isolated.
 MOST_CLIPPED_SCORE = 0.45
@@ -73,6 +73,7 @@ class SmallTargetFinder:
         self._history = History()
         self._warm_up_s = WARM_UP_S
         self._usual: Image | None = None  # mean difference from earlier images, float32
+        self._usual_t = 0.0  # its time
         self.shift: Array = np.zeros(2)  # of the camera since the first frame [px], (2,)
         self.repeated = False  # whether the last frame repeats the one before
 
@@ -89,7 +90,7 @@ class SmallTargetFinder:
         grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         *finer, grey = halvings(grey, WIDEST_PX)
         unit = 2 ** len(finer)
-        shift = self.camera.update(grey)  # measured without enlargement, in which soft scenes have no corners
+        shift = self.camera.update(grey, frame.t)  # measured without enlargement, in which soft scenes have no corners
         self.shift = unit * shift
         grey, times = (grey, 1) if finer else _enlarged(grey)
         shift = times * shift
@@ -117,7 +118,7 @@ class SmallTargetFinder:
                 found.append((target, detection))
             if detection.score >= ARRIVED and np.nanmax(since) >= ARRIVED:
                 arrived.append((target, detection))
-        differing = self._differing(grey, unit, times, shift, references)
+        differing = self._differing(frame.t, grey, unit, times, shift, references)
         found += [_as_a_whole(pair, arrived) for pair in differing]
         arrived.sort(key=lambda pair: -math.prod(pair[0].size))
         wholes = _apart([pair for pair in arrived if pair[0].whole], mostly_in)
@@ -130,7 +131,13 @@ class SmallTargetFinder:
         )
 
     def _differing(
-        self, grey: Image, unit: int, times: int, shift: Array, references: list[tuple[Image, Array] | None]
+        self,
+        t: float,
+        grey: Image,
+        unit: int,
+        times: int,
+        shift: Array,
+        references: list[tuple[Image, Array] | None],
     ) -> list[Found]:
         """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
 
@@ -150,10 +157,10 @@ class SmallTargetFinder:
             pixel = 2
             difference = cv2.resize(difference, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         if self._usual is None:
-            self._usual = np.zeros(difference.shape, np.float32)
+            self._usual, self._usual_t = np.zeros(difference.shape, np.float32), t
         usual = cv2.dilate(cv2.convertScaleAbs(self._usual, alpha=USUAL_TIMES), np.ones((SWAY_PX, SWAY_PX), np.uint8))
-        if self._history.kept_last:  # not every frame of a fast camera: it would become usual sooner
-            cv2.accumulateWeighted(difference, self._usual, USUAL_GAIN)
+        cv2.accumulateWeighted(difference, self._usual, 1 - math.exp((self._usual_t - t) / USUAL_S))
+        self._usual_t = t
         unusual = cv2.subtract(difference, usual)
         # A sky is zero but for the target; its surroundings are needed as well.
         least = LEAST_DIFFERENCE * LEAST_ROUGHNESS

@@ -1,0 +1,687 @@
+"""A pan-tilt-zoom camera that ONVIF moves: Profile S, or T with the media service of S.
+
+`OnvifDome` is the camera of a rig, and `OnvifLink` its protocol as `PolledHead` asks for it. The device says its media
+profiles, its coordinates with their ranges, and how it can be moved. It does not say how many degrees its coordinates
+are: `pan_deg` and `tilt_deg` of rig.toml are what their ends mean.
+
+Positions are asked for on a thread of its own, because a status may block while the device moves; every command has a
+connection of its own, so that a stop waits for nothing.
+
+Sources: ONVIF PTZ Service Specification 23.12, Media Service Specification, Core Specification.
+"""
+
+import contextlib
+import math
+import re
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import TimeoutError as NotDoneError
+from dataclasses import dataclass
+from os import environ
+from typing import NamedTuple
+from urllib.parse import urlsplit
+from xml.etree.ElementTree import Element
+
+from cotarget.drivers.axes import AxisFacts, Poll
+from cotarget.drivers.head_link import Pair, Requests
+from cotarget.drivers.link_errors import RefusedError, SilentError
+from cotarget.drivers.ptz import Dome, PtzLink, PtzSettings
+from cotarget.drivers.soap import (
+    DEVICE,
+    DEVICE_PATH,
+    FaultError,
+    LoginFaultError,
+    SoapClient,
+    find,
+    find_all,
+    quote,
+    text_at,
+)
+from cotarget.drivers.velocity import ReckonedAxis, SteeredAxis
+from cotarget.errors import ConfigError, DeviceError
+from cotarget.rig import Clock
+from cotarget.schema import NotNegative, Positive, model
+
+MEDIA, PTZ = "http://www.onvif.org/ver10/media/wsdl", "http://www.onvif.org/ver20/ptz/wsdl"
+SPACES = "http://www.onvif.org/ver10/tptz"
+# Ports at which cameras have ONVIF, the usual one first.
+PORTS = (80, 8000, 8080, 8899, 2020)
+ASK_S = 5.0  # for an answer while the device is opened [s]
+COMMAND_S = 1.5  # for the answer to a command [s]
+STATUS_S = 35.0  # for a status: some devices answer when a move has ended [s]
+STOP_S = 0.5  # for the answer to a stop, which is then repeated [s]
+LOOK_S = 0.01  # period of looking for a halt during a command [s]
+STATUS_PAUSE_S = 0.03  # between the answer to a status and the next question [s]
+STATUS_TRIES = 3  # failed statuses in a row, after which the device has gone
+RETRY_S = 0.2  # pause after a failed status [s]
+RIGHTS = "moving takes the rights of an operator or administrator"
+STILL_S = 0.3  # whether a device says that it moves cannot be believed; it stands after so long in one place [s]
+BLIND_S = 0.5  # positions are reckoned where the device has said none for so long [s]
+LATEST_S = 0.02  # a status that takes longer is of its end [s]
+TIMEOUT_S = 1.0  # a continuous move ends by itself after so long, where the device can that [s]
+FINE = 0.02  # velocities are sent again where they change by more, as a share of the highest
+ZOOM_STEPS = 1000  # in which the range of the zoom's number is divided
+ZOOM_SLACK = 0.01  # of that range, by which the reported number may be off
+
+
+@model
+class OnvifSettings(PtzSettings):
+    """A pan-tilt-zoom camera that ONVIF moves.
+
+    Attributes:
+        port: port of ONVIF; 0 to try those that cameras use.
+        url: address of its stream; empty for the one that the device says.
+        profile: token of the media profile; empty for the first that moves.
+        pan_deg: pan at the ends of the device's coordinates, with positive pan to the right [degrees].
+        tilt_deg: tilt at the ends of the device's coordinates, with positive tilt up [degrees].
+        speed_deg_s: speed of moves; the device turns so at its full speed [degrees/s].
+        slack_deg: largest distance of the reported position from the goal where it has arrived [degrees].
+        status_delay_s: by how much the positions that it reports are late, as measured [s].
+        zoom_s: time that the lens takes from end to end [s].
+        all_axes: whether each move names pan, tilt and zoom; for a device that takes a missing one as 0.
+    """
+
+    url: str = ""
+    profile: str = ""
+    slack_deg: NotNegative = 0.1
+    status_delay_s: NotNegative = 0.0
+    zoom_s: Positive = 10.0
+    speed_deg_s: Positive = 100.0
+    all_axes: bool = False
+
+
+# What the device says
+
+
+class Range(NamedTuple):
+    """Lowest and highest number of a coordinate or a speed."""
+
+    lowest: float
+    highest: float
+
+
+NOTHING = Range(0.0, 0.0)
+
+
+class Space(NamedTuple):
+    """A coordinate system: its name, and the ranges of its numbers."""
+
+    uri: str
+    ranges: tuple[Range, ...]
+
+
+@dataclass(frozen=True)
+class Abilities:
+    """How a device can be moved, by its configuration.
+
+    Attributes:
+        spaces: by the local name of the element, such as "AbsolutePanTiltPositionSpace"; the first of each counts.
+        timeout_s: shortest and longest time after which a continuous move may end by itself [s].
+    """
+
+    spaces: Mapping[str, tuple[Space, ...]]
+    timeout_s: Range
+
+    def space(self, name: str, uri: str = "") -> Space | None:
+        """Return the coordinate system of a name and URI, else the first of that name."""
+        known = self.spaces.get(name, ())
+        return next((space for space in known if space.uri == uri), known[0] if known else None)
+
+
+class Status(NamedTuple):
+    """Positions in the device's coordinates; None where it says none."""
+
+    pan: float | None
+    tilt: float | None
+    zoom: float | None
+    t: float  # on the rig's clock [s]
+    space: str = ""  # of pan and tilt
+
+
+def abilities_of(root: Element) -> Abilities:
+    """Read an answer to GetConfigurationOptions."""
+    options = find(root, "Body/GetConfigurationOptionsResponse/PTZConfigurationOptions")
+    spaces: dict[str, tuple[Space, ...]] = {}
+    for each in find(options, "Spaces") or ():
+        name = each.tag.rpartition("}")[2]
+        spaces[name] = (*spaces.get(name, ()), space_of(each))
+    shortest, longest = (seconds(text_at(options, f"PTZTimeout/{name}")) for name in ("Min", "Max"))
+    return Abilities(spaces, Range(shortest, longest))
+
+
+def space_of(element: Element) -> Space:
+    """Read a coordinate system."""
+    ranges = tuple(
+        Range(low, high)
+        for axis in ("XRange", "YRange")
+        if (low := number_at(element, f"{axis}/Min")) is not None
+        and (high := number_at(element, f"{axis}/Max")) is not None
+    )
+    return Space(text_at(element, "URI"), ranges)
+
+
+def number_at(element: Element | None, path: str) -> float | None:
+    """Return a finite number in an element; None where there is none."""
+    return _finite(text_at(element, path))
+
+
+def _finite(text: str | None) -> float | None:
+    try:
+        number = float(text or "")
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def seconds(text: str) -> float:
+    """Convert a duration of XML such as "PT1M30.5S" to seconds; 0 for what is none."""
+    found = re.fullmatch(r"P(?:(\d+)D)?(?:T(?:(\d+)H)?(?:(\d+)M)?(?:(\d+(?:\.\d+)?)S)?)?", text)
+    if found is None:
+        return 0.0
+    return sum(float(part or 0) * unit for part, unit in zip(found.groups(), (86400, 3600, 60, 1), strict=True))
+
+
+def status_of(root: Element, t: float) -> Status:
+    """Read an answer to GetStatus."""
+    position = find(root, "Body/GetStatusResponse/PTZStatus/Position")
+    turned, zoomed = find(position, "PanTilt"), find(position, "Zoom")
+    pan, tilt = (None if turned is None else _finite(turned.get(name)) for name in ("x", "y"))
+    space = "" if turned is None else turned.get("space", "")
+    return Status(pan, tilt, None if zoomed is None else _finite(zoomed.get("x")), t, space)
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """Conversion of one axis between the device's numbers and degrees in the device's sense."""
+
+    numbers: Range
+    degrees: Range
+
+    def to_degrees(self, number: float) -> float:
+        """Convert a number to degrees."""
+        return self.degrees.lowest + (number - self.numbers.lowest) * self._degrees_each
+
+    def to_number(self, degrees: float) -> float:
+        """Convert degrees to a number."""
+        return self.numbers.lowest + (degrees - self.degrees.lowest) / self._degrees_each
+
+    def way(self, degrees: float) -> float:
+        """Convert an angle between two positions to a difference of numbers."""
+        return degrees / self._degrees_each
+
+    @property
+    def _degrees_each(self) -> float:
+        return (self.degrees.highest - self.degrees.lowest) / (self.numbers.highest - self.numbers.lowest)
+
+
+# Messages
+
+
+def vector(pan: float | None, tilt: float | None, zoom: float | None, spaces: tuple[str, str] = ("", "")) -> str:
+    """Write positions or speeds as XML; axes that are None are left out."""
+    named = [f' space="{uri}"' if uri else "" for uri in spaces]
+    turned = "" if pan is None or tilt is None else f'<t:PanTilt x="{pan:.6f}" y="{tilt:.6f}"{named[0]}/>'
+    return turned + ("" if zoom is None else f'<t:Zoom x="{zoom:.6f}"{named[1]}/>')
+
+
+class OnvifDevice:
+    """The device's services, as far as they move it and show it.
+
+    Args:
+        settings: address, user and profile.
+        clock: the rig's clock.
+
+    Attributes:
+        name: of the device in messages.
+        model: maker, model and firmware.
+        url: address of its stream.
+        configuration: the PTZ configuration of its profile.
+        abilities: how it can be moved.
+
+    Raises:
+        ConfigError: it has no such profile.
+        DeviceError: there is no such device, it refuses the user, or it cannot be moved.
+    """
+
+    def __init__(self, settings: OnvifSettings, clock: Clock) -> None:
+        self._settings, self._clock = settings, clock
+        password = settings.password or environ.get(settings.password_env, "")
+        self._remedy = f"check hardware.ptz.user and the password, which may be in {settings.password_env}"
+        self.soap = self._connect(settings, password)
+        with contextlib.ExitStack() as opened:
+            opened.callback(self.soap.close)
+            self.name = self.soap.name
+            said = find(self._ask(DEVICE_PATH, DEVICE, "GetDeviceInformation"), "Body/GetDeviceInformationResponse")
+            names = (text_at(said, name) for name in ("Manufacturer", "Model", "FirmwareVersion"))
+            self.model = quote(" ".join(filter(None, names))) or "a device"
+            media, self._ptz = self._services()
+            self.profile, self.configuration = self._find_profile(media)
+            token = f"<ConfigurationToken>{self.configuration.get('token', '')}</ConfigurationToken>"
+            self.abilities = abilities_of(self._ask(self._ptz, PTZ, "GetConfigurationOptions", token))
+            self.url = self._stream_address(media)
+            opened.pop_all()
+
+    def status(self) -> Status:
+        """Ask for the positions."""
+        begin = self._clock.now()
+        root = self._ask(self._ptz, PTZ, "GetStatus", self._token, STATUS_S)
+        now = self._clock.now()
+        return status_of(root, now - min((now - begin) / 2, LATEST_S) - self._settings.status_delay_s)
+
+    def command(self, message: str, inner: str, timeout: float = COMMAND_S) -> None:
+        """Send a command; raises as `SoapClient.call` does."""
+        self._ask(self._ptz, PTZ, message, self._token + inner, timeout)
+
+    @property
+    def _token(self) -> str:
+        return f"<ProfileToken>{self.profile}</ProfileToken>"
+
+    def _ask(self, path: str, namespace: str, message: str, inner: str = "", timeout: float = ASK_S) -> Element:
+        return self.soap.call(path, namespace, message, inner, timeout)
+
+    def _connect(self, settings: OnvifSettings, password: str) -> SoapClient:
+        """Find the port where the device answers; the time can be asked for without a user on most devices."""
+        tried, errors = ([settings.port] if settings.port else list(PORTS)), list[DeviceError]()
+        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        for port in tried:
+            soap = SoapClient(f"{host}:{port}", settings.user, password, self._remedy)
+            try:
+                soap.call(DEVICE_PATH, DEVICE, "GetSystemDateAndTime", timeout=ASK_S)
+            except LoginFaultError:  # it wants a user even for its time
+                return soap
+            except DeviceError as error:
+                soap.close()
+                errors.append(error)
+                continue
+            return soap
+        if len(tried) == 1:
+            raise errors[0]
+        said = next((error for error in errors if "cannot be reached" not in str(error)), errors[0])
+        ports = ", ".join(map(str, tried))
+        raise DeviceError(f"{said}; ports {ports} were tried, and hardware.ptz.port is for another one")
+
+    def _services(self) -> tuple[str, str]:
+        """Return the paths of the media and the PTZ service."""
+        try:
+            root = self._ask(DEVICE_PATH, DEVICE, "GetCapabilities", "<Category>All</Category>")
+            found = find(root, "Body/GetCapabilitiesResponse/Capabilities")
+            media, ptz = text_at(found, "Media/XAddr"), text_at(found, "PTZ/XAddr")
+        except LoginFaultError:
+            raise
+        except FaultError:  # newer devices have GetServices alone
+            root = self._ask(DEVICE_PATH, DEVICE, "GetServices", "<IncludeCapability>false</IncludeCapability>")
+            known = find_all(root, "Body/GetServicesResponse/Service")
+            where = {text_at(each, "Namespace"): text_at(each, "XAddr") for each in known}
+            media, ptz = where.get(MEDIA, ""), where.get(PTZ, "")
+        if not ptz:
+            raise DeviceError(
+                f"{self.name} ({self.model}) has no pan-tilt-zoom service: it can be [hardware.fixed] with "
+                'driver = "stream"'
+            )
+        # Behind a router or a proxy a device gives an address that leads nowhere from here.
+        return urlsplit(media).path or DEVICE_PATH, urlsplit(ptz).path or DEVICE_PATH
+
+    def _find_profile(self, media: str) -> tuple[str, Element]:
+        """Return the token of the media profile, and its PTZ configuration."""
+        profiles = find_all(self._ask(media, MEDIA, "GetProfiles"), "Body/GetProfilesResponse/Profiles")
+        moving = {
+            profile.get("token", ""): configuration
+            for profile in profiles
+            if (configuration := find(profile, "PTZConfiguration")) is not None
+        }
+        names = [quote(profile.get("token", "")) for profile in profiles]
+        if not moving:
+            raise DeviceError(
+                f"{self.name} ({self.model}) has no media profile that moves, only {', '.join(names) or 'none'}: add "
+                "pan-tilt-zoom to one in the camera's page"
+            )
+        wanted = self._settings.profile or next(iter(moving))
+        if wanted not in moving:
+            raise ConfigError(
+                f"hardware.ptz.profile: {self.name} has no '{wanted}' that moves; valid here: {', '.join(moving)}"
+            )
+        return wanted, moving[wanted]
+
+    def _stream_address(self, media: str) -> str:
+        """Return the address of the stream, at the host that the user has given; empty where the device says none."""
+        setup = "<t:Stream>RTP-Unicast</t:Stream><t:Transport><t:Protocol>RTSP</t:Protocol></t:Transport>"
+        inner = f"<StreamSetup>{setup}</StreamSetup>{self._token}"
+        try:
+            root = self._ask(media, MEDIA, "GetStreamUri", inner)
+        except FaultError:
+            return ""
+        parts = urlsplit(text_at(root, "Body/GetStreamUriResponse/MediaUri/Uri"))
+        host = f"[{self._settings.host}]" if ":" in self._settings.host else self._settings.host
+        where = parts.netloc.rpartition("@")[2].rpartition(":")
+        port = f":{where[2]}" if where[1] and where[2].isdigit() else ""
+        return parts._replace(netloc=f"{host}{port}").geturl() if parts.netloc else ""
+
+
+# The link
+
+
+class StatusReader:
+    """Ask for the positions on a thread of its own, because a status may block for as long as the device moves."""
+
+    def __init__(self, ask: Callable[[], Status], first: Status) -> None:
+        self._ask = ask
+        self._newest = first
+        self._taken: Status | None = None
+        self._error: DeviceError | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="onvif status", daemon=True)
+        self._thread.start()
+
+    def take(self) -> Status | None:
+        """Return the newest positions; None where there are none since the last call.
+
+        Raises:
+            DeviceError: the device has gone.
+        """
+        if self._error is not None:
+            raise self._error
+        newest = self._newest
+        if newest is self._taken:
+            return None
+        self._taken = newest
+        return newest
+
+    def close(self) -> None:
+        """Let the thread end, without waiting for a status that blocks."""
+        self._closing.set()
+
+    def _run(self) -> None:
+        failed = 0
+        while not self._closing.wait(STATUS_PAUSE_S if not failed else RETRY_S):
+            try:
+                self._newest, failed = self._ask(), 0
+            except DeviceError as error:
+                failed += 1
+                if failed == STATUS_TRIES:
+                    self._error = error
+                    return
+
+
+class OnvifLink(PtzLink):
+    """The protocol of a camera that ONVIF moves; the camera was only asked.
+
+    Pan and tilt go to positions by absolute moves, or are steered there by velocities where the device has no absolute
+    moves. Positions that the device does not say are reckoned from the commands.
+
+    Raises:
+        ConfigError: it has no such profile.
+        DeviceError: there is no such camera, it refuses the user, or it cannot be moved to positions.
+    """
+
+    pause_s = 0.01
+
+    def __init__(self, settings: OnvifSettings, clock: Clock) -> None:
+        self._settings, self._clock = settings, clock
+        self._device = device = OnvifDevice(settings, clock)
+        self.name, self.url = device.name, device.url
+        self._who = f"{self.name} ({device.model})"
+        with contextlib.ExitStack() as opened:
+            opened.callback(device.soap.close)
+            status = device.status()
+            self._is_steered = self._refuse_unable(status)
+            self._coordinates = self._find_coordinates(status)
+            self.axes = self._find_axes()
+            self._reckoned = [ReckonedAxis(facts, settings.command_delay_s) for facts in self.axes]
+            self._steered = [SteeredAxis(facts, settings.command_delay_s) for facts in self.axes[:2]]
+            self._renewed, self._timeout_s = -math.inf, self._find_timeout()
+            self._seen, self._heard = status, clock.now()
+            self.identity = self._describe(status)
+            self._goals: tuple[float | None, float | None, float | None] = self._positions(status)
+            self._workers = ThreadPoolExecutor(4, "onvif command")
+            self._sent = Future[None]()  # of the newest command
+            self._sent.set_result(None)
+            self._reader = StatusReader(device.status, status)
+            opened.pop_all()
+
+    def poll(self, requests: Requests) -> Sequence[Poll]:
+        """Take the newest positions, and reckon those that the device does not say; steer an axis on its way."""
+        status, now = self._reader.take(), self._clock.now()
+        if status is not None:
+            self._heard, self._seen = now, status
+            polls = self._polls(status, now)
+            if self._is_steered:
+                self._steer(requests)
+            return polls
+        if now - self._heard < BLIND_S:
+            return []
+        if self._is_steered and any(axis.velocity for axis in self._steered):
+            self._stop(now + STOP_S)
+        return self._polls(Status(None, None, None, now), now)
+
+    def move(self, goals: Pair, speeds: Pair, requests: Requests) -> None:
+        """Send pan and tilt to positions by an absolute move, or begin to steer them there."""
+        self._goals, now = (*goals, self._goals[2]), self._clock.now()
+        if self._is_steered:
+            for axis, goal, speed in zip(self._steered, goals, speeds, strict=True):
+                axis.aim(goal, speed, now)
+            self._steer(requests)
+            return
+        zoom = self._goals[2] if self._settings.all_axes else None
+        fastest = self._settings.speed_deg_s
+        self._absolute(goals, zoom, tuple(min(speed / fastest, 1.0) for speed in speeds), requests)
+        for reckoned, goal, speed in zip(self._reckoned[:2], goals, speeds, strict=True):
+            reckoned.command(goal, speed, now)
+
+    def zoom(self, position: float, requests: Requests) -> None:
+        """Send the lens to a position."""
+        self._goals = (*self._goals[:2], position)
+        pan, tilt, _ = self._goals
+        both = (pan, tilt) if self._settings.all_axes and pan is not None and tilt is not None else None
+        self._absolute(both, position, None, requests)
+        self._reckoned[2].command(position, self.axes[2].fastest, self._clock.now())
+
+    def halt(self, patience: float) -> None:
+        """Stop pan and tilt; once more when a command that was given up is answered, since it may move them later."""
+        deadline = self._clock.now() + max(patience, STOP_S)
+        self._goals = (None, None, self._goals[2])
+        self._stop(deadline)
+        if not self._sent.done():
+            wait([self._sent], max(deadline - self._clock.now(), 0.0))
+            self._stop(deadline)
+
+    def close(self) -> None:
+        """Release the connections; never raises."""
+        self._reader.close()
+        self._workers.shutdown(wait=False)
+        self._device.soap.close()
+
+    # What the device is
+
+    def _refuse_unable(self, status: Status) -> bool:
+        """Refuse a device that can be neither sent nor steered to positions; return whether it has to be steered."""
+        abilities, who = self._device.abilities, self._who
+        if not abilities.space("AbsoluteZoomPositionSpace") and abilities.spaces:
+            raise DeviceError(f"{who} has no zoom that goes to positions: it is not driven")
+        if abilities.space("AbsolutePanTiltPositionSpace"):
+            return False
+        if not abilities.space("ContinuousPanTiltVelocitySpace"):
+            by = "steps" if abilities.space("RelativePanTiltTranslationSpace") else "presets"
+            raise DeviceError(f"{who} has neither absolute moves nor velocities, only {by}: it is not driven")
+        if status.pan is None or status.tilt is None:
+            raise DeviceError(f"{who} can only be moved by velocities, and does not say where it is: it is not driven")
+        return True
+
+    def _find_timeout(self) -> float | None:
+        """Return the timeout of continuous moves [s]; None where the device has none of its own choice."""
+        shortest, longest = self._device.abilities.timeout_s
+        return min(max(TIMEOUT_S, shortest), longest) if longest > 0 else None
+
+    def _find_coordinates(self, status: Status) -> tuple[Coordinate, Coordinate, Coordinate]:
+        """Find the coordinate systems of the moves, which have to be those of the status."""
+        settings, abilities = self._settings, self._device.abilities
+        turned = abilities.space("AbsolutePanTiltPositionSpace", status.space) or self._limits_space()
+        zoomed = abilities.space("AbsoluteZoomPositionSpace")
+        assert zoomed is not None
+        ranges = (*(*turned.ranges, NOTHING, NOTHING)[:2], (*zoomed.ranges, NOTHING)[0])
+        for word, given in zip(("pan", "tilt", "zoom"), ranges, strict=True):
+            if not given.lowest < given.highest:
+                raise DeviceError(
+                    f"{self._who} says that {word} goes from {given.lowest:g} to {given.highest:g}: it is not driven"
+                )
+        self._uris = (turned.uri, zoomed.uri)
+        own_degrees = turned.uri.endswith("SphericalPositionSpaceDegrees")
+        found = []
+        limits = (settings.pan_deg, settings.tilt_deg)
+        for sign, degrees, numbers in zip(settings.signs, limits, ranges[:2], strict=True):
+            ends = Range(*sorted(sign * end for end in degrees))
+            found.append(Coordinate(numbers, numbers if own_degrees else ends))
+        return found[0], found[1], Coordinate(ranges[2], ranges[2])
+
+    def _limits_space(self) -> Space:
+        """Return the coordinates of the status of a device without absolute moves: those of its limits."""
+        space = find(self._device.configuration, "PanTiltLimits/Range")
+        return Space("", ()) if space is None else space_of(space)
+
+    def _find_axes(self) -> tuple[AxisFacts, AxisFacts, AxisFacts]:
+        settings = self._settings
+        pan, tilt = (
+            AxisFacts(
+                unit=math.radians(1.0),
+                lowest=coordinate.degrees.lowest,
+                highest=coordinate.degrees.highest,
+                fastest=settings.speed_deg_s,
+                step=step,
+                slack=settings.slack_deg,
+                still_s=STILL_S,
+                loses_steps=False,
+            )
+            for coordinate, step in zip(self._coordinates[:2], settings.steps_deg, strict=True)
+        )
+        lowest, highest = self._coordinates[2].numbers
+        width = highest - lowest
+        lens = AxisFacts(
+            unit=1.0,
+            lowest=lowest,
+            highest=highest,
+            fastest=width / settings.zoom_s,
+            step=width / ZOOM_STEPS,
+            slack=ZOOM_SLACK * width,
+            still_s=STILL_S,
+            loses_steps=False,
+        )
+        return pan, tilt, lens
+
+    def _describe(self, status: Status) -> str:
+        """Describe the device in one line."""
+        positions = zip(("pan", "tilt", "zoom"), self._positions(status), ("degrees", "degrees", ""), strict=True)
+        where = [
+            f"{word} {at:.1f} {unit}" if unit else f"{word} {at:g}" for word, at, unit in positions if at is not None
+        ]
+        missing = [word for word, number in zip(("pan", "tilt", "zoom"), status[:3], strict=True) if number is None]
+        if missing:
+            where.append(f"no position of {' and '.join(missing)}, which is reckoned from the commands")
+        off = self._device.soap.clock_off_s
+        clock = [f"its clock {off:+.0f} s off"] if abs(off) > 1.0 else []
+        way = ["steered by velocities"] if self._is_steered else []
+        address = self.name.removeprefix("the device at ")
+        parts = [f"{self._device.model} at {address}", f"profile {quote(self._device.profile)}", *clock, *way, *where]
+        return ", ".join(parts)
+
+    def _positions(self, status: Status) -> tuple[float | None, float | None, float | None]:
+        """Convert positions to degrees in the device's sense, and to the zoom's number; None where there are none."""
+        pan, tilt, zoom = (
+            None if number is None else coordinate.to_degrees(number)
+            for number, coordinate in zip(status[:3], self._coordinates, strict=True)
+        )
+        return pan, tilt, zoom
+
+    def _polls(self, status: Status, now: float) -> list[Poll]:
+        """Make polls of the positions that were said, and of those that are reckoned."""
+        polls = []
+        for i, (position, reckoned) in enumerate(zip(self._positions(status), self._reckoned, strict=True)):
+            if position is None:
+                here, sigma = reckoned.at(now)
+                polls.append(Poll(i, here, now, sigma=sigma))
+            else:
+                reckoned.correct(position, status.t)
+                polls.append(Poll(i, position, status.t))
+        return polls
+
+    # Commands
+
+    def _steer(self, requests: Requests) -> None:
+        """Send the velocities that lead to the goals, where they change, or before the device ends them by itself."""
+        now = self._clock.now()
+        pan, tilt, _ = self._positions(self._seen)
+        assert pan is not None
+        assert tilt is not None
+        wanted = [axis.wanted(at, self._seen.t, now) for axis, at in zip(self._steered, (pan, tilt), strict=True)]
+        fastest = self._settings.speed_deg_s
+        same = all(
+            abs(speed - axis.velocity) <= FINE * fastest and (speed == 0) == (axis.velocity == 0)
+            for speed, axis in zip(wanted, self._steered, strict=True)
+        )
+        due = any(wanted) and now - self._renewed > (self._timeout_s or TIMEOUT_S) / 2
+        if same and not due:
+            return
+        zoom = 0.0 if self._settings.all_axes else None
+        velocity = f"<Velocity>{vector(wanted[0] / fastest, wanted[1] / fastest, zoom)}</Velocity>"
+        timeout = f"<Timeout>PT{self._timeout_s:g}S</Timeout>" if self._timeout_s else ""
+        try:
+            self._send("ContinuousMove", velocity + timeout, requests)
+        except RefusedError:
+            if not timeout:
+                raise
+            self._timeout_s = None  # some refuse a timeout though they say its range
+            self._send("ContinuousMove", velocity, requests)
+        self._renewed = now
+        for axis, speed in zip(self._steered, wanted, strict=True):
+            axis.send(speed, now)
+
+    def _stop(self, deadline: float) -> None:
+        """Stop by a stop and by velocities of zero, since devices may ignore one; repeat both until one is answered."""
+        zoom = 0.0 if self._settings.all_axes else None
+        orders = [("Stop", "<PanTilt>true</PanTilt><Zoom>false</Zoom>")]
+        if self._device.abilities.space("ContinuousPanTiltVelocitySpace"):
+            orders.append(("ContinuousMove", f"<Velocity>{vector(0.0, 0.0, zoom)}</Velocity>"))
+        while True:
+            answers = [self._workers.submit(self._device.command, *order, STOP_S) for order in orders]
+            errors = [error for answer in answers if (error := answer.exception()) is not None]
+            if len(errors) < len(orders):
+                now = self._clock.now()
+                for steered in self._steered:
+                    steered.stop(now)
+                for reckoned in self._reckoned[:2]:
+                    reckoned.halt(now)
+                return
+            if self._clock.now() > deadline or not any(isinstance(error, SilentError) for error in errors):
+                why = f"; {RIGHTS}" if isinstance(errors[0], LoginFaultError) else ""
+                raise DeviceError(f"{self.name} does not stop: {errors[0]}{why}") from errors[0]
+
+    def _absolute(
+        self, goals: Pair | None, zoom: float | None, speeds: tuple[float, ...] | None, requests: Requests
+    ) -> None:
+        pan, tilt = (None, None) if goals is None else map(Coordinate.to_number, self._coordinates[:2], goals)
+        inner = f"<Position>{vector(pan, tilt, zoom, self._uris)}</Position>"
+        if speeds is not None and goals is not None:
+            inner += f"<Speed>{vector(speeds[0], speeds[1], None)}</Speed>"
+        self._send("AbsoluteMove", inner, requests)
+
+    def _send(self, message: str, inner: str, requests: Requests) -> None:
+        """Send a command; give up waiting for its answer where a halt waits."""
+        self._sent = self._workers.submit(self._device.command, message, inner)
+        while True:
+            try:
+                self._sent.result(timeout=LOOK_S)
+            except NotDoneError:
+                if requests.halt_waits():
+                    requests.proceed()
+            except LoginFaultError as error:
+                raise RefusedError(f"{error}; {RIGHTS}") from None
+            except FaultError as error:
+                raise RefusedError(str(error)) from None
+            else:
+                return
+
+
+class OnvifDome(Dome):
+    """A camera that ONVIF moves; arguments and errors are those of `Dome`."""
+
+    Settings = OnvifSettings
+    Link = OnvifLink

@@ -1,0 +1,241 @@
+"""A pan-tilt-zoom camera in one housing: what all domes share, whatever protocol moves them.
+
+A protocol is a `PtzLink`: a `HeadLink` with the zoom as its third axis. Its constructor takes the settings and the
+rig's clock, connects, and identifies the device without changing anything. `Dome` makes zoom camera, lens and head of
+it and of the device's stream, with one connection to the head, one lock and one guard. A driver is four lines:
+
+    class ViscaDome(Dome):
+        Settings = ViscaSettings  # a PtzSettings
+        Link = ViscaLink  # a PtzLink
+
+The link's calls, by what they do: `poll` is the status (positions of pan, tilt and zoom, each with its time); `move`
+sends pan and tilt to positions at speeds, and `renew` goes on with velocities where the device has no positions; `zoom`
+sends the lens; `halt` stops, and returns when that is acknowledged; `close` releases the connection. `axes` holds the
+units, ranges, steps and speeds of pan, tilt and zoom, in the device's own numbers; the zoom's step is above zero.
+"""
+
+import contextlib
+import itertools
+import math
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from annotated_types import Interval, Lt
+
+from cotarget.config import SafetyConfig
+from cotarget.drivers.axes import AxisFacts
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.head_link import HeadLink
+from cotarget.drivers.lens import LensPositions
+from cotarget.drivers.polled_head import (
+    LOOP_HALT_S,
+    NOTHING_SAID,
+    PolledHead,
+    PolledHeadSettings,
+    PolledLens,
+    braking_s,
+)
+from cotarget.drivers.stream import EXAMPLE, StreamCamera, StreamSettings, stream_address
+from cotarget.errors import ConfigError
+from cotarget.rig import Clock, Frame, UnitSpec, ZoomSpec, ZoomState
+from cotarget.schema import Check, Limits, Needed, NotNegative, Positive, Size, model
+
+Knots = tuple[tuple[float, float], ...]  # (zoom number, magnification)
+
+
+def _knots(lens: Knots) -> Knots:
+    if lens and (len(lens) < 2 or any(b[0] <= a[0] or b[1] <= a[1] for a, b in itertools.pairwise(lens))):
+        raise ValueError("needs two or more [number, magnification], both of them increasing")
+    return lens
+
+
+@model
+class PtzSettings(PolledHeadSettings):
+    """A camera with pan, tilt and zoom behind one address.
+
+    Attributes:
+        host: address of the device, without a port.
+        port: port of the protocol that moves it; 0 for the protocol's own.
+        url: address of its stream, as of a fixed camera with driver "stream".
+        user: user name; empty where the device asks for none.
+        password: password; empty where an environment variable holds it.
+        password_env: name of that variable.
+        transport: how RTSP brings the pictures; UDP loses some on a busy network.
+        size: image size that is expected [px].
+        rate_hz: frames per second.
+        latency_s: time from light to a frame's arrival, as measured [s].
+        wide_deg: horizontal field of view at the shortest focal length [degrees].
+        lens: some zoom numbers and their magnifications, both increasing; between them the logarithm of the
+            magnification is interpolated. Empty for the protocol's own table.
+        step_deg: step size of pan and tilt, or of each; 0 for what the protocol or the device says [degrees].
+        command_delay_s: time from a command to the start of motion of head and lens, as measured [s].
+    """
+
+    host: Annotated[str, Needed("192.168.0.88")] = ""
+    port: Annotated[int, Interval(ge=0, le=65535)] = 0
+    url: Annotated[str, Needed(EXAMPLE), Check(stream_address)] = ""
+    user: str = ""
+    password: str = ""
+    password_env: str = "COTARGET_PASSWORD"
+    transport: Literal["tcp", "udp"] = "tcp"
+    size: Size = (1920, 1080)
+    rate_hz: Positive = 25.0
+    latency_s: NotNegative = 0.3
+    wide_deg: Annotated[Positive, Lt(180.0)] = 60.0
+    lens: Annotated[tuple[Annotated[tuple[float, Positive], "[number, magnification]"], ...], Check(_knots)] = ()
+    step_deg: NotNegative | Annotated[tuple[NotNegative, NotNegative], "[pan, tilt]"] = 0.0
+    pan_deg: Limits = (-170.0, 170.0)
+    tilt_deg: Limits = (-30.0, 90.0)
+    speed_deg_s: Positive = 80.0
+    command_delay_s: NotNegative = 0.1
+
+    @property
+    def address(self) -> str:
+        """Address of the device, with its port where one is set."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{host}:{self.port}" if self.port else host
+
+    @property
+    def knots(self) -> Knots:
+        """Zoom numbers and magnifications; a protocol with a table of its own gives that where `lens` is empty."""
+        return self.lens or ((0.0, 1.0), (1.0, 20.0))
+
+    @property
+    def wide_px(self) -> float:
+        """Nominal focal length at magnification 1 [px]."""
+        return self.size[0] / 2 / math.tan(math.radians(self.wide_deg) / 2)
+
+    @property
+    def spec(self) -> UnitSpec:  # type: ignore[override]
+        """Describe zoom camera and head."""
+        (_, least), *_, (_, most) = self.knots
+        focal_range = (least * self.wide_px, most * self.wide_px)
+        zoom = ZoomSpec(self.size, self.rate_hz, self.latency_s, focal_range, self.size, self.command_delay_s)
+        return UnitSpec(zoom, super().spec)
+
+    def stream(self, url: str = "") -> StreamSettings:
+        """Make the settings of its stream; ``url`` where the device says it and the file does not."""
+        same = ("user", "password", "password_env", "transport", "size", "rate_hz", "latency_s")
+        return StreamSettings(url=self.url or url, **{name: getattr(self, name) for name in same})
+
+
+class PtzLink(HeadLink):
+    """The protocol of a pan-tilt-zoom device, connected and identified; the device was not changed yet.
+
+    Attributes:
+        identity: the device in one line, for `cotarget doctor`.
+        url: address of the stream, as the device says it; empty where it cannot.
+    """
+
+    axes: tuple[AxisFacts, AxisFacts, AxisFacts]
+    identity: str = ""
+    url: str = ""
+
+    def make_ready(self) -> None:
+        """Halt the device and set it up for moves; by default only the halt."""
+        self.halt(LOOP_HALT_S + braking_s(self.axes))
+
+
+class DomeCamera:
+    """The stream of a dome, and its lens."""
+
+    def __init__(self, stream: StreamCamera, lens: PolledLens, clock: Clock) -> None:
+        self._stream, self._lens, self._clock = stream, lens, clock
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the frames [px]."""
+        return self._stream.size
+
+    still_size = size  # a still is a frame of the stream
+
+    @property
+    def focal_range(self) -> tuple[float, float]:
+        """Shortest and longest nominal focal length [px]."""
+        return self._lens.focal_range
+
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        """Wait for a frame, see `FrameBuffer.read`."""
+        return self._stream.read(newer_than, timeout)
+
+    def capture(self) -> Frame:
+        """Read the next frame."""
+        return self._stream.read(newer_than=self._clock.now())
+
+    def zoom(self, focal_px: float) -> float:
+        """Start the lens moving, see `PolledLens.zoom`."""
+        return self._lens.zoom(focal_px)
+
+    def state(self) -> ZoomState:
+        """Return the lens's state, see `PolledLens.state`."""
+        return self._lens.state()
+
+    def describe(self) -> str:
+        """Describe the stream in one line, see `StreamReader.describe`."""
+        return self._stream.describe()
+
+
+class Dome:
+    """A pan-tilt-zoom camera that is open; the head stands. Close it after use.
+
+    Args:
+        config: addresses of device and stream, and what they are expected to be.
+        clock: the rig's clock.
+        safety: speed cap and stop file.
+
+    Attributes:
+        head: the head, a `PolledHead`.
+        zoom: the zoom camera.
+
+    Raises:
+        ConfigError: the device differs from the configuration.
+        DeviceError: there is no such device, it cannot be moved, or its stream brings no picture.
+    """
+
+    Settings: ClassVar[type[PtzSettings]]
+    Link: ClassVar[type[Any]]  # a PtzLink, made of settings and clock
+
+    @classmethod
+    def probe(cls, settings: PtzSettings) -> str:
+        """Describe device and stream in one line; nothing is changed. Raises as the constructor does."""
+        with contextlib.closing(cls.Link(settings, MonotonicClock())) as link:
+            return f"{link.identity}; {StreamCamera.probe(_with_address(settings.stream(link.url)))}"
+
+    def __init__(self, config: PtzSettings, clock: Clock, safety: SafetyConfig = NOTHING_SAID) -> None:
+        links = list[PtzLink]()
+
+        def open_link() -> PtzLink:
+            links.append(type(self).Link(config, clock))
+            with contextlib.ExitStack() as opened:
+                opened.enter_context(contextlib.closing(links[0]))
+                links[0].make_ready()
+                opened.pop_all()
+            return links[0]
+
+        self.head = PolledHead(open_link, config, clock, safety)
+        try:
+            self._stream = StreamCamera(_with_address(config.stream(links[0].url)), clock)
+        except BaseException:
+            self.head.close()
+            raise
+        lens = self.head.lens(lens_positions(config, links[0].axes[2]))
+        self.zoom = DomeCamera(self._stream, lens, clock)
+
+    def close(self) -> None:
+        """Halt the head, then release both; never raises, and may be called again."""
+        self.head.close()
+        self._stream.close()
+
+
+def lens_positions(config: PtzSettings, axis: AxisFacts) -> LensPositions:
+    """Make the focal lengths of a lens's numbers, those within the axis and the table."""
+    knots = tuple((number, magnification * config.wide_px) for number, magnification in config.knots)
+    lowest, highest = max(axis.lowest, knots[0][0]), min(axis.highest, knots[-1][0])
+    numbers = np.linspace(lowest, highest, round((highest - lowest) / axis.step) + 1)
+    return LensPositions(knots, numbers.tolist())
+
+
+def _with_address(stream: StreamSettings) -> StreamSettings:
+    if not stream.url:
+        raise ConfigError(f'hardware.ptz.url: is missing, and the device names no stream; write url = "{EXAMPLE}"')
+    return stream

@@ -1,0 +1,117 @@
+"""Axes that do not say where they are, or do not go where they are sent: dead reckoning, and steering by velocity.
+
+Positions and speeds are in the numbers of the axis's facts. Times are on the rig's clock [s].
+"""
+
+from collections import deque
+from dataclasses import replace
+
+from cotarget.drivers.axes import AxisFacts
+from cotarget.drivers.lens import LensMotion
+
+SPEED_SHARE = 0.1  # relative standard deviation of a speed that nobody has measured
+SLOWEST = 1e-6  # a speed of zero would never arrive
+GAIN_HZ = 4.0  # of steering; above a third of the inverse of the unpredicted dead time it would overshoot
+FLOW_S = 0.5  # goals that follow each other as soon move along
+FLOW_GAIN = 0.4  # by which the newest pair of goals changes their estimated speed
+
+
+class ReckonedAxis:
+    """Where an axis should be by its commands.
+
+    Two motions with the same commands begin at the ends of the range; the position is known where they have met.
+
+    Args:
+        facts: range and highest speed of the axis.
+        delay: time from a command to the start of motion [s].
+    """
+
+    def __init__(self, facts: AxisFacts, delay: float) -> None:
+        self._delay = delay
+        ends = (facts.lowest, facts.highest)
+        self._motions = [LensMotion(end, end, 0.0, facts.fastest) for end in ends]
+
+    def correct(self, position: float, t: float) -> None:
+        """Take a position that the device has said; a motion under way goes on from there."""
+        newest = self._motions[0]
+        goal = position if t >= max(motion.arrives for motion in self._motions) else newest.goal
+        self._motions = [LensMotion(position, goal, max(t, newest.t), newest.speed)] * 2
+
+    def command(self, goal: float, speed: float, now: float) -> None:
+        """Start a motion to a goal."""
+        moved = [motion.toward(goal, now + self._delay) for motion in self._motions]
+        self._motions = [replace(motion, speed=max(speed, SLOWEST)) for motion in moved]
+
+    def halt(self, now: float) -> None:
+        """End the motion where the axis should be."""
+        places = [motion.position(now) for motion in self._motions]
+        self._motions = [LensMotion(place, place, now, 1.0) for place in places]
+
+    def at(self, t: float) -> tuple[float, float]:
+        """Return the position at a time, and its standard deviation."""
+        a, b = (float(motion.position(t)) for motion in self._motions)
+        here = (a + b) / 2
+        return here, abs(b - a) / 2 + SPEED_SHARE * abs(self._motions[0].goal - here)
+
+
+class SteeredAxis:
+    """Velocities that lead an axis to its goal, and along with goals that move.
+
+    The position is predicted from the newest one that the device has said and the velocities sent since.
+
+    Args:
+        facts: of the axis.
+        delay: time from a command to the start of motion [s].
+    """
+
+    def __init__(self, facts: AxisFacts, delay: float) -> None:
+        self._facts, self._delay = facts, delay
+        self._sent = deque([(0.0, 0.0)], maxlen=100)  # (time, velocity)
+        self._goal: float | None = None
+        self._limit, self._flow, self._aimed = facts.fastest, 0.0, -FLOW_S
+
+    @property
+    def velocity(self) -> float:
+        """The velocity sent last [1/s]."""
+        return self._sent[-1][1]
+
+    def aim(self, goal: float, speed: float, now: float) -> None:
+        """Set a goal and the highest speed."""
+        passed = now - self._aimed
+        if self._goal is None or passed >= FLOW_S:
+            self._flow = 0.0
+        elif passed > 0:
+            self._flow += FLOW_GAIN * ((goal - self._goal) / passed - self._flow)
+        self._goal, self._limit, self._aimed = goal, speed, now
+
+    def stop(self, now: float) -> None:
+        """Forget the goal; the axis was stopped."""
+        self._goal = None
+        self._sent.append((now, 0.0))
+
+    def wanted(self, position: float, t: float, now: float) -> float:
+        """Return the velocity to send now [1/s].
+
+        Args:
+            position: that the device has said.
+            t: time of it.
+            now: the time.
+        """
+        if self._goal is None:
+            return 0.0
+        flow = self._flow if now - self._aimed < FLOW_S else 0.0
+        error = self._goal + flow * (now - self._aimed) - self._predicted(position, t, now)
+        if abs(error) <= max(self._facts.slack / 2, self._facts.same) and abs(flow) < GAIN_HZ * self._facts.slack:
+            return 0.0
+        return min(max(flow + GAIN_HZ * error, -self._limit), self._limit)
+
+    def send(self, velocity: float, now: float) -> None:
+        """Note a velocity that was sent."""
+        self._sent.append((now, velocity))
+
+    def _predicted(self, position: float, t: float, now: float) -> float:
+        """Predict the position at which a command of now takes effect."""
+        ends = [*(begin for begin, _ in list(self._sent)[1:]), now]
+        for (begin, velocity), end in zip(self._sent, ends, strict=True):
+            position += velocity * max(end - max(begin, t - self._delay), 0.0)
+        return position

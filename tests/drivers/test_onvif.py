@@ -1,0 +1,336 @@
+"""The driver of ONVIF domes on the emulated dome: moves, halts, users and clocks, and what devices do otherwise."""
+
+import contextlib
+import dataclasses
+import math
+import re
+import threading
+import time
+
+import pytest
+
+from cotarget.config import SafetyConfig
+from cotarget.drivers import onvif
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.onvif import OnvifDome, OnvifLink
+from cotarget.errors import ConfigError, CotargetError
+from tests.support.onvif_dome import STEP_DEG, OnvifUnit
+from tests.support.plants import PASSWORD, fails, wait_for
+
+pytestmark = pytest.mark.wire
+SAFETY = SafetyConfig(stop_file=None)
+NEAR_DEG = 2 * STEP_DEG
+SETTLED_S = 0.5  # of a halt's answer and of braking from the highest speed
+
+
+@contextlib.contextmanager
+def opened(unit, **changes):
+    settings = dataclasses.replace(unit.settings, **changes)
+    with contextlib.closing(OnvifDome(settings, MonotonicClock(), SAFETY)) as dome:
+        yield dome
+
+
+def refused(unit, **changes):
+    """The error of a dome that cannot be opened; it has one line, and nothing has moved."""
+    begin = time.monotonic()
+    with pytest.raises(CotargetError) as caught:
+        OnvifDome(dataclasses.replace(unit.settings, **changes), MonotonicClock(), SAFETY)
+    assert time.monotonic() < begin + 20.0
+    assert set(unit.moves) <= {"ContinuousMove"}  # of a halt
+    assert not unit.turning()
+    assert len(str(caught.value).splitlines()) == 1
+    assert PASSWORD not in str(caught.value)
+    return str(caught.value)
+
+
+def test_the_head_goes_where_it_is_sent_and_the_lens_too():
+    with OnvifUnit() as unit, opened(unit) as dome:
+        commanded = dome.head.move(math.radians(20.0), math.radians(-10.0), wait=True)
+        assert [math.degrees(angle) for angle in commanded] == pytest.approx([20.0, -10.0])
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((20.0, -10.0), abs=NEAR_DEG)
+        state = dome.head.state()
+        assert not state.moving
+        assert (math.degrees(state.pan), math.degrees(state.tilt)) == pytest.approx((20.0, -10.0), abs=NEAR_DEG)
+        shortest, longest = dome.zoom.focal_range
+        assert longest == pytest.approx(10 * shortest)
+        reached = dome.zoom.zoom(longest)
+        wait_for(lambda: not dome.zoom.state().moving)
+        assert dome.zoom.state().focal_px == pytest.approx(reached, rel=0.02)
+        assert unit.lens.position() == unit.lens.last
+        assert dome.zoom.read(timeout=10.0).image.shape == (240, 320, 3)
+
+
+@pytest.mark.parametrize("profile", ["pan-reversed", "tilt-reversed"])
+def test_signs_of_rig_toml_turn_an_axis_that_counts_the_other_way(profile):
+    sign = {f"{profile.partition('-')[0]}_sign": -1}
+    limits = {"pan_deg": (-170.0, 150.0)} if profile == "pan-reversed" else {"tilt_deg": (-90.0, 30.0)}
+    with OnvifUnit(profile) as unit, opened(unit, **sign) as dome:
+        dome.head.move(math.radians(20.0), math.radians(15.0), wait=True)
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((20.0, 15.0), abs=NEAR_DEG), limits
+
+
+@pytest.mark.parametrize("profile", ["wide-ranges", "degrees", "always-moving", "boolean-status", "behind-nat"])
+def test_other_ranges_spaces_states_and_addresses_are_understood(profile):
+    with OnvifUnit(profile) as unit, opened(unit) as dome:
+        dome.head.move(math.radians(-20.0), math.radians(10.0), wait=True)
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((-20.0, 10.0), abs=NEAR_DEG)
+        assert not dome.head.state().moving
+        assert dome.zoom.read(timeout=10.0).image.shape == (240, 320, 3)
+
+
+def test_a_speed_is_a_share_of_the_highest():
+    with OnvifUnit() as unit, opened(unit) as dome:
+        begin = time.monotonic()
+        dome.head.move(math.radians(10.0), 0.0, speed=math.radians(10.0), wait=True)
+        assert time.monotonic() - begin > 1.0
+
+
+def test_a_device_that_takes_a_missing_axis_as_zero_gets_all_of_them():
+    with OnvifUnit("missing-is-zero") as unit, opened(unit, all_axes=True) as dome:
+        dome.head.move(math.radians(20.0), math.radians(15.0), wait=True)
+        dome.zoom.zoom(dome.zoom.focal_range[1])
+        wait_for(lambda: not dome.zoom.state().moving)
+        dome.head.move(math.radians(25.0), math.radians(15.0), wait=True)
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((25.0, 15.0), abs=NEAR_DEG)
+        assert unit.lens.position() == unit.lens.last
+
+
+# Halts
+
+
+@pytest.mark.parametrize("profiles", [
+    (), ("stop-fault",), ("stop-ignored",), ("slow-stop",), ("slower-stop",), ("slow-answers",), ("stale-status",),
+    ("clock-10h",),
+], ids=",".join)  # fmt: skip
+def test_a_halt_stops_the_head_before_its_goal(profiles):
+    late_s = {"slow-stop": 0.4, "slower-stop": 1.1, "slow-answers": 0.9}.get("".join(profiles), 0.0)
+    with OnvifUnit(*profiles) as unit, opened(unit) as dome:
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(40.0))
+        wait_for(lambda: unit.pan.degrees() > 5.0)
+        dome.head.halt()
+        time.sleep(late_s + SETTLED_S)
+        assert not unit.turning()
+        assert unit.pan.degrees() < 120.0
+        wait_for(lambda: not dome.head.state().moving)
+
+
+def test_closing_and_an_error_of_the_caller_leave_the_head_at_rest():
+    with OnvifUnit() as unit:
+        with contextlib.suppress(ZeroDivisionError), opened(unit) as dome:
+            dome.head.move(math.radians(140.0), 0.0, speed=math.radians(40.0))
+            wait_for(lambda: unit.pan.degrees() > 5.0)
+            1 / 0  # noqa: B018
+        time.sleep(SETTLED_S)
+        assert not unit.turning()
+        assert unit.pan.degrees() < 120.0
+
+
+def test_a_status_that_blocks_delays_no_halt():
+    with OnvifUnit("blocking-status") as unit, opened(unit) as dome:
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(40.0))
+        wait_for(lambda: unit.pan.degrees() > 5.0)
+        begin = time.monotonic()
+        dome.head.halt()
+        assert time.monotonic() - begin < SETTLED_S
+        wait_for(lambda: not unit.turning())
+        assert unit.pan.degrees() < 120.0
+
+
+def test_a_move_without_an_answer_delays_no_halt_and_cannot_outlive_it():
+    with OnvifUnit() as unit, opened(unit) as dome:
+        unit.faults.set("slow-answers")
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(40.0))
+        time.sleep(0.05)
+        dome.head.halt()
+        unit.faults.set("slow-answers", False)
+        time.sleep(1.0)
+        assert not unit.turning()
+        assert unit.pan.degrees() < 60.0
+
+
+def test_a_device_that_goes_away_is_an_error_of_one_line():
+    with OnvifUnit() as unit, opened(unit) as dome:
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(40.0))
+        unit.faults.set("refuse")
+        unit.server._disconnect()
+        said = fails(dome.head.state)
+        assert len(said.splitlines()) == 1
+        assert "check host and port" in said
+        unit.faults.set("refuse", False)
+
+
+@pytest.mark.parametrize("fault", ["silence", "garbage", "half-answers", "not-soap", "endless", "bomb", "unauthorized"])
+def test_a_fault_in_mid_move_is_an_error_of_one_line(fault, monkeypatch):
+    monkeypatch.setattr(onvif, "STATUS_S", 1.0)
+    with OnvifUnit() as unit, opened(unit) as dome:
+        dome.head.move(math.radians(30.0), 0.0, speed=math.radians(20.0))
+        unit.faults.set(fault)
+        said = fails(dome.head.state)
+        assert len(said.splitlines()) == 1
+        unit.faults.set(fault, False)
+
+
+# Devices that do not say where they are, or do not go where they are sent
+
+
+@pytest.mark.parametrize("profile", ["no-status", "zoom-status", "blocking-status"])
+def test_positions_that_are_not_said_are_reckoned(profile):
+    with OnvifUnit(profile) as unit, opened(unit, zoom_s=1.0) as dome:
+        assert (math.degrees(dome.head.state().sigma) > 50.0) == (profile != "blocking-status")
+        dome.head.move(math.radians(-20.0), math.radians(10.0), wait=True)
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((-20.0, 10.0), abs=NEAR_DEG)
+        state = dome.head.state()
+        assert (math.degrees(state.pan), math.degrees(state.tilt)) == pytest.approx((-20.0, 10.0), abs=NEAR_DEG)
+        assert state.sigma == 0.0
+        dome.head.move(math.radians(10.0), math.radians(10.0), speed=math.radians(20.0))
+        wait_for(lambda: unit.pan.degrees() > -5.0)
+        state = dome.head.state()
+        assert math.degrees(state.pan) == pytest.approx(unit.pan.degrees(), abs=15.0)
+        dome.zoom.zoom(dome.zoom.focal_range[1])
+        wait_for(lambda: not dome.zoom.state().moving)
+        assert dome.zoom.state().focal_px == pytest.approx(dome.zoom.focal_range[1], rel=0.02)
+
+
+@pytest.mark.parametrize("profiles", [
+    ("no-absolute",), ("continuous-only",), ("continuous-only", "timeout-fault"), ("continuous-only", "slow-stop"),
+    ("continuous-only", "stop-ignored"), ("continuous-only", "timeout-clamped"), ("continuous-only", "wide-ranges"),
+], ids=",".join)  # fmt: skip
+def test_a_device_that_takes_velocities_is_steered_to_its_goal(profiles):
+    with OnvifUnit(*profiles) as unit, opened(unit) as dome:
+        for pan, tilt in ((25.0, 10.0), (24.5, 10.0), (-30.0, 12.0)):
+            dome.head.move(math.radians(pan), math.radians(tilt), speed=math.radians(60.0), wait=True)
+            slack = unit.settings.slack_deg + NEAR_DEG
+            assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((pan, tilt), abs=slack)
+        assert "AbsoluteMove" not in unit.moves[1:]
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(40.0))
+        wait_for(lambda: unit.pan.degrees() > 0.0)
+        dome.head.halt()
+        time.sleep(SETTLED_S + 0.4)
+        assert not unit.turning()
+        assert unit.pan.degrees() < 80.0
+
+
+def test_a_steered_device_goes_on_beyond_its_default_timeout(monkeypatch):
+    """At 10 degrees/s, 15 degrees take longer than the timeout of one second."""
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        dome.head.move(math.radians(25.0), 0.0, speed=math.radians(10.0), wait=True)
+        assert unit.pan.degrees() == pytest.approx(25.0, abs=unit.settings.slack_deg + NEAR_DEG)
+
+
+def test_a_steered_device_stops_by_itself_where_the_program_dies(monkeypatch):
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(10.0))
+        wait_for(lambda: unit.turning())
+        monkeypatch.setattr(OnvifLink, "poll", lambda link, requests: [])  # as if it hung
+        wait_for(lambda: not unit.turning())
+        assert unit.pan.degrees() < 30.0
+
+
+def test_a_steered_head_follows_a_goal_that_moves():
+    """At 8 degrees/s and ten goals a second; without the goals' own speed it would lag by 2 degrees."""
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        begin, lags = time.monotonic(), []
+        while (passed := time.monotonic() - begin) < 4.0:
+            dome.head.move(math.radians(8.0 * passed), 0.0)
+            time.sleep(0.1)
+            lags.append(8.0 * (time.monotonic() - begin) - unit.pan.degrees())
+        assert abs(sorted(lags[20:])[len(lags[20:]) // 2]) < 1.5
+
+
+# What is wrong from the start
+
+
+@pytest.mark.parametrize(("profile", "said"), [
+    ("no-ptz", r"has no pan-tilt-zoom service: it can be \[hardware.fixed\]"),
+    ("presets-only", "has neither absolute moves nor velocities, only presets: it is not driven"),
+    ("continuous-only,no-status", "can only be moved by velocities, and does not say where it is: it is not driven"),
+    ("no-zoom", "says that zoom goes from 1 to 1"),
+    ("unauthorized", "not for the user 'root': check hardware.ptz.user and the password"),
+    ("silence", "did not answer GetSystemDateAndTime in time"), ("refuse", "broke off|cannot be reached"),
+    ("garbage", "no SOAP"), ("half-answers", "broke off"), ("not-soap", "no SOAP"), ("bomb", "it has a document type"),
+    ("endless", "without end"),
+])  # fmt: skip
+def test_a_dome_that_cannot_be_driven_is_named_in_one_line(profile, said, monkeypatch):
+    monkeypatch.setattr(onvif, "ASK_S", 2.0)
+    with OnvifUnit(*profile.split(",")) as unit:
+        assert re.search(said, refused(unit))
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"password": "wrong"}, "not for the user 'root': check hardware.ptz.user and the password, which may be in"),
+    ({"user": "", "password": ""}, "it without a user: check hardware.ptz.user"),
+    ({"profile": "other"}, "hardware.ptz.profile: .* has no 'other' that moves; valid here: profile_1"),
+    ({"port": 1}, r"cannot be reached \(Connection refused\): check host and port"),
+    ({"host": "nowhere.invalid"}, "cannot be reached"),
+    ({"size": (640, 480)}, r"hardware.fixed.size: \[640, 480\] is not what"),
+])  # fmt: skip
+def test_wrong_settings_are_named_in_one_line(changes, said):
+    with OnvifUnit() as unit:
+        assert re.search(said, refused(unit, **changes))
+
+
+def test_another_protocol_at_the_port_is_named():
+    with OnvifUnit() as unit:
+        assert re.search("did not answer|broke off|no SOAP|HTTP", refused(unit, port=unit.stream.port))
+
+
+def test_usual_ports_are_tried_where_none_is_given(monkeypatch):
+    with OnvifUnit() as unit:
+        monkeypatch.setattr(onvif, "PORTS", (1, unit.server.port))
+        with opened(unit, port=0) as dome:
+            assert dome.head.state().t > 0
+        monkeypatch.setattr(onvif, "PORTS", (1, 2))
+        assert "ports 1, 2 were tried, and hardware.ptz.port is for another one" in refused(unit, port=0)
+
+
+# Users and clocks
+
+
+@pytest.mark.parametrize("profiles", [
+    ("clock-20s",), ("clock-10h",), ("clock-10h", "time-needs-user"), ("http-digest",), ("http-digest", "clock-20s"),
+], ids=",".join)  # fmt: skip
+def test_a_user_is_let_in_whatever_the_devices_clock(profiles):
+    with OnvifUnit(*profiles) as unit, contextlib.closing(OnvifLink(unit.settings, MonotonicClock())) as link:
+        assert unit.server.counts.refused <= 1
+        wanted = sum({"clock-20s": 20.0, "clock-10h": -36000.0}.get(name, 0.0) for name in profiles)
+        assert link._device.soap.clock_off_s == pytest.approx(wanted, abs=1.0)
+        assert bool(wanted) == ("its clock" in link.identity)
+
+
+def test_a_clock_that_is_set_meanwhile_is_asked_again():
+    with OnvifUnit() as unit, opened(unit) as dome:
+        unit.faults.set("clock-10h")
+        dome.head.move(math.radians(5.0), 0.0, wait=True)
+        assert unit.pan.degrees() == pytest.approx(5.0, abs=NEAR_DEG)
+
+
+def test_a_user_without_the_right_to_move_is_told():
+    with OnvifUnit("needs-administrator") as unit:
+        assert "moving takes the rights of an operator or administrator" in refused(unit)
+
+
+def test_a_dome_without_a_password_is_opened_without_one():
+    with OnvifUnit(login=False) as unit, opened(unit) as dome:
+        dome.head.move(math.radians(3.0), 0.0, wait=True)
+
+
+def test_a_probe_describes_device_and_stream_and_moves_nothing(monkeypatch):
+    monkeypatch.setattr("cotarget.drivers.stream.PROBE_S", 0.5)
+    monkeypatch.setattr("cotarget.drivers.stream.LONGEST_PROBE_S", 0.5)
+    with OnvifUnit() as unit:
+        said = OnvifDome.probe(unit.settings)
+        assert said.startswith(f"cotarget Emulated dome 1.0 at 127.0.0.1:{unit.server.port}, profile profile_1, pan ")
+        assert "320x240 h264" in said
+        assert unit.moves == []
+
+
+def test_no_thread_is_left():
+    before = set(threading.enumerate())
+    with OnvifUnit() as unit, opened(unit) as dome:
+        dome.head.state()
+    wait_for(lambda: set(threading.enumerate()) <= before)
+
+
+def test_wrong_limits_are_refused():
+    with OnvifUnit("degrees") as unit, pytest.raises(ConfigError, match="pan_deg"):
+        OnvifDome(dataclasses.replace(unit.settings, pan_deg=(-90.0, 90.0)), MonotonicClock(), SAFETY)

@@ -1,0 +1,136 @@
+"""SOAP of ONVIF by hand: XML, the user's token, faults, durations and spaces."""
+
+import base64
+import hashlib
+from datetime import UTC, datetime
+from xml.etree.ElementTree import fromstring
+
+import pytest
+
+from cotarget.drivers.onvif import Coordinate, Range, abilities_of, seconds, status_of, vector
+from cotarget.drivers.soap import device_time, fault_of, find, parse_xml, text_at, user_token
+from cotarget.emulators.onvif import BOMB
+
+TT = "http://www.onvif.org/ver10/schema"
+
+
+def said(body):
+    """An answer, whose prefixes are none that a client may rely on."""
+    return parse_xml(
+        f'<?xml version="1.0"?><env:Envelope xmlns:env="http://www.w3.org/2003/05/soap-envelope" xmlns:q="{TT}" '
+        f'xmlns:er="http://www.onvif.org/ver10/error"><env:Body>{body}</env:Body></env:Envelope>'.encode()
+    )
+
+
+@pytest.mark.parametrize("data", [
+    BOMB.encode(), b'<!DOCTYPE a SYSTEM "file:///etc/passwd"><a/>', b"", b"<a>", b"\x00\xff<<",
+    b'<?xml version="1.0" encoding="nonsense"?><a/>', BOMB.encode("utf-16"),
+])  # fmt: skip
+def test_what_is_no_plain_xml_is_refused(data):
+    with pytest.raises(ValueError, match=r"."):
+        parse_xml(data)
+
+
+def test_the_password_is_sent_as_a_digest_of_nonce_time_and_password():
+    """The example of ONVIF's Application Programmer's Guide, 6.1.1.3."""
+    nonce = base64.b64decode("LKqI6G/AikKCQrN0zqZFlg==")
+    header = fromstring(
+        user_token("user", "userpassword", datetime(2010, 9, 16, 7, 50, 45, tzinfo=UTC), nonce).replace(
+            "<s:Header>", '<s:Header xmlns:s="x">'
+        )
+    )
+    token = "{*}Security/{*}UsernameToken/{*}"
+    assert header.find(f"{token}Created").text == "2010-09-16T07:50:45.000Z"
+    assert header.find(f"{token}Nonce").text == "LKqI6G/AikKCQrN0zqZFlg=="
+    wanted = base64.b64encode(hashlib.sha1(nonce + b"2010-09-16T07:50:45.000Zuserpassword").digest()).decode()
+    assert header.find(f"{token}Password").text == wanted
+
+
+def test_a_fault_is_its_reason_and_its_innermost_codes():
+    root = said(
+        "<env:Fault><env:Code><env:Value>env:Sender</env:Value><env:Subcode><env:Value>er:NotAuthorized</env:Value>"
+        "</env:Subcode></env:Code><env:Reason><env:Text>Sender\n  not Authorized</env:Text></env:Reason></env:Fault>"
+    )
+    fault = fault_of(root, "the device at x", "Stop")
+    assert type(fault).__name__ == "LoginFaultError"
+    assert fault.codes == ("Sender", "NotAuthorized")
+    assert str(fault) == "the device at x refuses Stop: Sender not Authorized"
+    assert fault_of(said("<StopResponse/>"), "x", "Stop") is None
+
+
+@pytest.mark.parametrize(("text", "value"), [
+    ("PT5S", 5.0), ("PT1M30.5S", 90.5), ("P1DT1H", 90000.0), ("PT0S", 0.0), ("", 0.0), ("5", 0.0), ("PT-1S", 0.0),
+])  # fmt: skip
+def test_durations(text, value):
+    assert seconds(text) == value
+
+
+def test_the_devices_time_is_its_utc_time():
+    clock = "<q:Time><q:Hour>23</q:Hour><q:Minute>5</q:Minute><q:Second>{}</q:Second></q:Time>"
+    date = "<q:Date><q:Year>2026</q:Year><q:Month>2</q:Month><q:Day>{}</q:Day></q:Date>"
+    wrapped = (
+        "<r:GetSystemDateAndTimeResponse xmlns:r='x'><r:SystemDateAndTime><q:UTCDateTime>{}{}</q:UTCDateTime>"
+        "</r:SystemDateAndTime></r:GetSystemDateAndTimeResponse>"
+    )
+    found = device_time(said(wrapped.format(clock.format(7), date.format(28))))
+    assert found == datetime(2026, 2, 28, 23, 5, 7, tzinfo=UTC)
+    assert device_time(said(wrapped.format(clock.format(60), date.format(28)))) is not None  # a leap second
+    assert device_time(said(wrapped.format(clock.format(7), date.format(30)))) is None
+    assert device_time(said("<other/>")) is None
+
+
+def status(inner):
+    return status_of(
+        said(f"<r:GetStatusResponse xmlns:r='x'><r:PTZStatus>{inner}</r:PTZStatus></r:GetStatusResponse>"), 3.0
+    )
+
+
+@pytest.mark.parametrize(("inner", "wanted"), [
+    ('<q:Position><q:PanTilt x="0.5" y="-1" space="u"/><q:Zoom x="0"/></q:Position>', (0.5, -1.0, 0.0)),
+    ('<q:Position><q:Zoom x="0.25"/></q:Position>', (None, None, 0.25)),
+    ('<q:Position><q:PanTilt x="nan" y="-"/></q:Position>', (None, None, None)),
+    ('<q:Position><q:PanTilt/></q:Position>', (None, None, None)),
+    ("", (None, None, None)),
+])  # fmt: skip
+def test_a_number_that_a_status_lacks_is_unknown_and_not_zero(inner, wanted):
+    assert status(inner)[:3] == wanted
+
+
+def test_spaces_have_their_ranges_and_the_timeout_its_limits():
+    space = (
+        "<q:{0}><q:URI>{1}</q:URI><q:XRange><q:Min>0</q:Min><q:Max>360</q:Max></q:XRange>"
+        "<q:YRange><q:Min>-90</q:Min><q:Max>9e1</q:Max></q:YRange></q:{0}>"
+    )
+    name = "AbsolutePanTiltPositionSpace"
+    found = abilities_of(
+        said(
+            "<r:GetConfigurationOptionsResponse xmlns:r='x'><r:PTZConfigurationOptions><q:Spaces>"
+            f"{space.format(name, 'plain')}{space.format(name, 'degrees')}</q:Spaces>"
+            "<q:PTZTimeout><q:Min>PT1S</q:Min><q:Max>PT10M</q:Max></q:PTZTimeout>"
+            "</r:PTZConfigurationOptions></r:GetConfigurationOptionsResponse>"
+        )
+    )
+    assert found.timeout_s == (1.0, 600.0)
+    assert found.space(name).uri == "plain"
+    assert found.space(name, "degrees").uri == "degrees"
+    assert found.space(name, "other").ranges == (Range(0.0, 360.0), Range(-90.0, 90.0))
+    assert found.space("AbsoluteZoomPositionSpace") is None
+
+
+def test_coordinates_are_converted_at_their_ends():
+    """From -1 to 1 is from -30 to 90 degrees: 0 is 30."""
+    coordinate = Coordinate(Range(-1.0, 1.0), Range(-30.0, 90.0))
+    assert [coordinate.to_degrees(number) for number in (-1, 0, 1)] == [-30.0, 30.0, 90.0]
+    assert coordinate.to_number(60.0) == pytest.approx(0.5)
+
+
+def test_a_vector_leaves_out_what_is_not_named():
+    assert vector(0.5, -1.0, None) == '<t:PanTilt x="0.500000" y="-1.000000"/>'
+    assert vector(None, None, 0.1, ("", "u")) == '<t:Zoom x="0.100000" space="u"/>'
+
+
+def test_elements_are_found_in_any_namespace():
+    root = said("<a xmlns='1'><b xmlns='2'> c </b></a>")
+    assert text_at(root, "Body/a/b") == "c"
+    assert find(root, "Body/b") is None
+    assert text_at(None, "a") == ""

@@ -1,0 +1,78 @@
+"""Dead reckoning and steering of axes, in simulated time."""
+
+import math
+
+import pytest
+
+from cotarget.drivers.axes import AxisFacts
+from cotarget.drivers.velocity import ReckonedAxis, SteeredAxis
+
+FACTS = AxisFacts(unit=1.0, lowest=-100.0, highest=100.0, fastest=50.0, step=0.0, slack=0.1, loses_steps=False)
+DELAY_S = 0.1
+
+
+def test_an_axis_of_unknown_position_arrives_when_it_must_have():
+    """From the far end, 150 away, at 50/s: 3 s and the delay, also where the command is repeated meanwhile."""
+    for repeated in (1, 58):
+        axis = ReckonedAxis(FACTS, DELAY_S)
+        assert axis.at(0.0)[1] >= 100.0  # it may be anywhere
+        for i in range(repeated):
+            axis.command(50.0, 50.0, i * 0.05)
+        position, sigma = axis.at(2.9)
+        # Of 40, from the far end, and 50; and a tenth of what is left, since the speed is not known well.
+        assert position == pytest.approx(45.0)
+        assert sigma == pytest.approx(5.5)
+        assert axis.at(3.11) == (50.0, 0.0)
+
+
+def test_a_known_axis_is_where_its_speed_takes_it():
+    axis = ReckonedAxis(FACTS, DELAY_S)
+    axis.correct(0.0, 0.0)
+    axis.command(20.0, 10.0, 0.0)
+    assert axis.at(1.1) == (pytest.approx(10.0), pytest.approx(1.0))
+    axis.halt(1.1)
+    assert axis.at(9.0) == (pytest.approx(10.0), 0.0)
+    axis.correct(11.0, 9.0)
+    assert axis.at(9.5) == (11.0, 0.0)
+
+
+def steered(goals, seconds, late=0.05, start=0.0):
+    """Positions of an axis that turns at the velocities it gets, ``DELAY_S`` later, and is asked 20 times a second."""
+    axis, position, sent, places = SteeredAxis(FACTS, DELAY_S), start, [], []
+    history = [(-1.0, start)]
+    for i in range(round(seconds * 100)):
+        now = i / 100
+        velocity = next((v for t, v in reversed(sent) if t <= now - DELAY_S), 0.0)
+        position += velocity / 100
+        history.append((now, position))
+        if i % 10 == 0 and (goal := goals(now)) is not None:
+            axis.aim(goal, 50.0, now)
+        if i % 5 == 0:
+            t = now - late
+            seen = next(p for when, p in reversed(history) if when <= t)
+            velocity = axis.wanted(seen, t, now)
+            axis.send(velocity, now)
+            sent.append((now, velocity))
+        places.append(position)
+    return places
+
+
+def test_an_axis_is_steered_to_its_goal_without_going_beyond():
+    places = steered(lambda now: 30.0 if now == 0 else None, 3.0)
+    assert max(places) < 30.0 + 2 * FACTS.slack
+    assert places[-1] == pytest.approx(30.0, abs=FACTS.slack)
+
+
+def test_an_axis_keeps_up_with_a_goal_that_moves():
+    """As late as the delay, over which who sets the goals predicts."""
+    places = steered(lambda now: 8.0 * now, 4.0)
+    assert places[-1] == pytest.approx(8.0 * (4.0 - DELAY_S), abs=0.3)
+
+
+def test_no_velocity_is_above_the_limit():
+    axis = SteeredAxis(FACTS, DELAY_S)
+    axis.aim(90.0, 20.0, 0.0)
+    assert axis.wanted(0.0, 0.0, 0.0) == 20.0
+    axis.stop(0.1)
+    assert axis.wanted(0.0, 0.1, 0.1) == 0.0
+    assert math.isclose(axis.velocity, 0.0)
