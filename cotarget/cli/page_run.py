@@ -107,9 +107,13 @@ class PageRun:
             session = Session(rig, run, self._stop_file, follow, time.monotonic, recordings)
             with Page(session, self._listener, self._host) as page:
                 self._announce(page.link, follow.unattended)
-                for step in paced(session.steps(seconds), rig.spec.real_time, time.monotonic, time.sleep):
-                    page.show(step, rig.spec)
-                    yield step
+                try:
+                    for step in paced(session.steps(seconds), rig.spec.real_time, time.monotonic, time.sleep):
+                        page.show(step, rig.spec)
+                        yield step
+                except KeyboardInterrupt as error:
+                    recordings.interrupt = error
+                    raise
 
         return steps
 
@@ -141,10 +145,12 @@ class Recordings(contextlib.AbstractContextManager["Recordings", None]):
     Attributes:
         folder: folder of the recording; empty while nothing is recorded.
         make_run: makes a new run on the open rig.
+        interrupt: the Ctrl-C that cut the last step short; a replay does not miss commands after it then.
     """
 
     def __init__(self, first: Path | None, make: "Callable[[Path], Recorder]") -> None:
         self.folder, self.make_run = "", cast("Callable[[], Run]", None)
+        self.interrupt: KeyboardInterrupt | None = None
         self._base, self._make = first or Path("recording"), make
         self._recorder: Recorder | None = None
         self._rig: RecordedRig | None = None
@@ -199,6 +205,8 @@ class Recordings(contextlib.AbstractContextManager["Recordings", None]):
         """Complete all recordings, after the rig was closed."""
         for thread in self._completing:
             thread.join()
+        if kind is None and self.interrupt is not None:
+            kind, error = KeyboardInterrupt, self.interrupt
         if self._recorder is not None:
             self._recorder.__exit__(kind, error, trace)
 

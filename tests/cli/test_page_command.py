@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from cotarget.page.server import LOOPBACK, listen
+from cotarget.pipeline import HeadRun
 from tests.support.commands import call, refused
 from tests.support.page_client import browser, picture, say, status, until
 
@@ -123,3 +124,21 @@ def test_a_recording_that_begins_in_the_middle_replays(folder, capsys, monkeypat
         assert json.loads(out)["steps"] >= 2
         lines = (folder / name / "log.jsonl").read_text().splitlines()
         assert json.loads(lines[-1])["end"] == "complete"
+
+
+@pytest.mark.render
+def test_a_ctrl_c_in_the_middle_of_a_step_is_the_end_of_its_recording(folder, capsys, monkeypatch):
+    monkeypatch.setattr("cotarget.cli.page_run.PageRun._announce", lambda self, link, unattended: None)
+    rest, calls = HeadRun.rest, []
+
+    def interrupted(self):
+        calls.append(None)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return rest(self)
+
+    monkeypatch.setattr(HeadRun, "rest", interrupted)
+    assert call(capsys, "follow", "--page", "--page-port", 0, "--record", "run")[0] == 0
+    monkeypatch.setattr(HeadRun, "rest", rest)
+    assert json.loads((folder / "run" / "log.jsonl").read_text().splitlines()[-1])["end"] == "KeyboardInterrupt"
+    assert call(capsys, "replay", "run", "--check")[0] == 0
