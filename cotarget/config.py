@@ -519,7 +519,7 @@ class TargetProfile:
         """Find the angle from the image's v axis to the target's own vertical axis, by the shape of its box [rad].
 
         The axis lies between the v axis and the head's pan axis, because either may be the vertical: a camera may be
-        mounted sideways, or the head. The box of an ellipse of the usual shape tells where, from a roll of `LEVEL` on;
+        mounted sideways, or the head. The box of an ellipse of the usual shape says where, from a roll of `LEVEL` on;
         below, it is the v axis. Without a usual shape, and for a template, whose box does not turn with it, it is the
         pan axis.
 
@@ -646,7 +646,7 @@ class FollowConfig:
         ignored: regions of the fixed camera's image in which nothing is detected, such as a clock, a flag or a road:
             polygons of three or more points, in parts of the image from 0 to 1, u to the right and v down.
         when_idle: what a head that is steered from a page does after nothing was followed for `idle_s`: wait for the
-            next target where it is; stand until it is told to follow; or go home once, and stand there.
+            next target where it is; stand until an order to follow; or go home once, and stand there.
         idle_s: that time [s].
         unattended: whether a head goes on following when the last page closes, or stands.
     """

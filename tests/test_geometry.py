@@ -89,7 +89,7 @@ def test_without_a_calibrated_head_there_is_no_pose_in_the_base():
 
 
 def test_a_turned_fixed_camera_gives_the_rays_of_before():
-    """OpenCV projects points into a camera that was turned; the shift of the point ahead tells by how much."""
+    """OpenCV projects points into a camera that was turned; the shift of the point ahead says by how much."""
     size, center, focal, distortion = (640, 480), (319.5, 239.5), 500.0, np.array([-0.2, 0.0, 0.0, 0.0])
     K = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1.0]])
     rotated = np.radians([0.6, -0.8, 0.0])  # from the frame before to the turned camera's

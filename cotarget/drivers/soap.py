@@ -34,7 +34,7 @@ DEVICE_PATH = "/onvif/device_service"
 CONNECT_S = 2.0  # on a local network a running device accepts a connection within milliseconds [s]
 LONGEST_ANSWER = 1 << 20  # [bytes]; the longest list of profiles has a tenth
 LONGEST_QUOTE = 100  # of a device's text in a message [characters]
-CLOCK_S = 5.0  # a clock that is off by more is told in messages [s]
+CLOCK_S = 5.0  # a clock that is off by more is named in messages [s]
 NOT_AUTHORIZED = "NotAuthorized"
 
 

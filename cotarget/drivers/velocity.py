@@ -9,7 +9,7 @@ from dataclasses import replace
 from cotarget.drivers.axes import AxisFacts
 from cotarget.drivers.lens import LensMotion
 
-SPEED_SHARE = 0.1  # relative standard deviation of a speed that nobody has measured
+SPEED_SHARE = 0.1  # relative standard deviation of a speed that was not measured
 SLOWEST = 1e-6  # a speed of zero would never arrive
 GAIN_HZ = 4.0  # of steering; above a third of the inverse of the unpredicted dead time it would overshoot
 FLOW_S = 0.5  # goals that follow each other as soon move along

@@ -56,7 +56,7 @@ FAMILIES = {
     "evi_d70": Family(170 / 0x08DB, (*EVI_SPEEDS, 100.0), EVI_SPEEDS),  # the BirdDog P100 too
     "evi_d80": Family(170 / 0x1E1B, (*EVI_SPEEDS, 100.0), EVI_SPEEDS),  # and D90
 }
-OUTSIDE_DEG = 5.0  # beyond the range by so much, a position shows that the units are wrong
+OUTSIDE_DEG = 5.0  # this far beyond the range, a position shows that the units are wrong
 ROUNDING = 1e-9  # relative; of a speed after its conversion
 # An axis that turns at the slowest index moves a count in less time [s].
 STILL_S = 0.15

@@ -5,7 +5,7 @@ time over one of three transports: UDP with Sony's header, which numbers the mes
 finds by asking which one a camera has.
 
 A camera answers an order by an acknowledgement with the number of one of its two sockets, and later by a completion,
-which nobody waits for here. Cameras differ in the numbers of their answers: some repeat the one of the message, some
+which is not waited for here. Cameras differ in the numbers of their answers: some repeat the one of the message, some
 always send 1, some fall silent after a few messages until their counter is reset.
 
 Sources: Sony's EVI-D70 and EVI-D80/D90 technical manuals; Sony's VISCA over IP, as in the manual of the SRG-300H.

@@ -704,7 +704,7 @@ class Tokens:
 
 # The server
 
-CLIENT_S = 30.0  # a client that sends nothing for so long has gone [s]
+CLIENT_S = 30.0  # a client that sends nothing for this time has gone [s]
 LONGEST_REQUEST = 1 << 18  # [bytes]
 SLOW_S = 0.3
 SILENT_S = 60.0

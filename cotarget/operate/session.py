@@ -174,7 +174,7 @@ class Session:
     def record(self, on: bool, *, by: str | None = None) -> None:
         """Begin a recording, or complete it.
 
-        A recording begins with a new run, so that its replay knows all that the run does: tracks begin anew, and a
+        A recording begins with a new run, so that its replay knows all that the run does: tracks begin again, and a
         head that followed follows again as soon as there is a track.
         """
         self._refuse_other(by)
