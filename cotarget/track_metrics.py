@@ -114,7 +114,8 @@ def compare(labels: Sequence[Box], tracks: Sequence[Box]) -> Overlap:
         for boxes in (labels, tracks)
         for name in ("center_px", "size_px")
     )
-    area, area_of_track = size.prod(axis=-1)[:, None], extent.prod(axis=-1)
+    # A track outside of the image has no area after it is cut to it.
+    area, area_of_track = size.prod(axis=-1)[:, None], np.maximum(extent.prod(axis=-1), np.finfo(float).tiny)
     shared = intersection_areas(at, size, center, extent)
     distance_px = np.linalg.norm(at[:, None] - center, axis=-1)
     return Overlap(shared / (area + area_of_track - shared), shared / area, shared / area_of_track, distance_px)

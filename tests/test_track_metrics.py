@@ -521,3 +521,11 @@ def test_trackeval_agrees(tmp_path):
     theirs = json.loads(subprocess.run(command, check=True, capture_output=True, text=True, timeout=100).stdout)
     assert theirs["id_switches"] > 10
     assert theirs == pytest.approx({name: getattr(score, name) for name in theirs}, rel=1e-12)
+
+
+def test_a_track_that_was_cut_to_nothing_at_the_border_is_false():
+    """Its filtered box may lie outside; filters of warnings make a division by its area an error here."""
+    label = Label(np.array([20.0, 50.0]), np.array([40.0, 80.0]), 1)
+    outside = Tracked(np.array([-0.5, 50.0]), np.array([0.0, 20.0]), 100, 4.0, 7)
+    score = score_tracks([outside], {100: [label]}, 25.0, 101)
+    assert (score.boxes, score.found, score.false_boxes) == (1, 0, 1)

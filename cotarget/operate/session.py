@@ -180,6 +180,8 @@ class Session:
         self._refuse_other(by)
         if self._records is None:
             raise ConfigError("this session cannot be recorded")
+        if on and self.stopped is not None:  # a new run moves the lens
+            raise ConfigError("stopped: nothing moves before Clear")
         with self._lock:
             self._to_record = on
 
@@ -219,6 +221,7 @@ class Session:
         with self._lock:
             if self.stopped is not None and order.kind != "stand":
                 raise ConfigError("stopped: nothing moves before Clear")
+            self._idle_since = None
             if order.kind != "zoom":
                 self._turning.pop(order.of, None)
                 self._orders = [each for each in self._orders if each.kind in ("stop", "zoom")]
@@ -329,4 +332,6 @@ class Session:
         elif step.t - self._idle_since >= self._config.idle_s:
             self._idle_since = None
             with self._lock:
+                if self._orders:  # the operator's own count
+                    return
                 self._orders.append(Order("stand" if self._config.when_idle == "stand" else "home", HEAD))

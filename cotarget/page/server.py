@@ -11,6 +11,7 @@ import base64
 import hashlib
 import hmac
 import http
+import ipaddress
 import json
 import logging
 import re
@@ -54,10 +55,12 @@ HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9.-]+)(:\d{1,5})?")
 TOKEN_BYTES = 16
 HELLO_S = 2.0  # time for the first message, and for a request
 MOST_STRANGERS = 32  # connections without the token
+MOST_SENTENCES = 16  # that wait for a slow line
 TICK_S = 0.1  # period of ticks
 RATE_HZ, BURST = 60.0, 120.0  # messages of one browser: in the long run, and at once
 REFUSED, TOO_MUCH = 4401, 1008  # closing codes: without the token; against the rules
 CLOSE_S = 1.0  # time for a closing handshake
+PING_S = 2.0  # period of asking whether a browser is there, and time for its answer
 LINE_S = 3.0  # time for the thread to start and to end
 
 
@@ -72,13 +75,15 @@ def listen(host: str, port: int) -> socket.socket:
         ConfigError: the address stands for all addresses, whose names are not known.
         DeviceError: the address is not one of this machine, or the port is in use or not permitted.
     """
-    if host in ("0.0.0.0", "::", ""):
-        raise ConfigError(f"--page-host {host or repr('')}: give the one name or address that browsers will use")
     try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind)
+        family, kind, _, _, address = socket.getaddrinfo(host or "::", port, type=socket.SOCK_STREAM)[0]
+    except UnicodeError:
+        raise ConfigError(f"--page-host {host}: is no name of a machine") from None
     except OSError as error:
         raise DeviceError(f"--page-host {host}: {error.strerror}") from None
+    if ipaddress.ip_address(address[0]).is_unspecified:
+        raise ConfigError(f"--page-host {host or repr('')}: give the one name or address that browsers will use")
+    listener = socket.socket(family, kind)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind(address)
@@ -114,6 +119,7 @@ class Client:
         who: name that its page has chosen; only its equality counts.
         wake: set when there may be a picture to send.
         drawn: whether it has drawn the last picture.
+        sentences: why orders were refused, until they are sent.
         allowance: messages that it may send now.
         counted_t: time of the last message [s].
     """
@@ -122,6 +128,7 @@ class Client:
     who: str
     wake: asyncio.Event = field(default_factory=asyncio.Event)
     drawn: bool = True
+    sentences: asyncio.Queue[str] = field(default_factory=lambda: asyncio.Queue(MOST_SENTENCES))
     allowance: float = BURST
     counted_t: float = field(default_factory=monotonic)
 
@@ -235,6 +242,8 @@ class Page:
             max_queue=16,
             open_timeout=HELLO_S,
             close_timeout=CLOSE_S,
+            ping_interval=PING_S,
+            ping_timeout=PING_S,
             server_header=None,
             logger=quiet,
         ):
@@ -301,7 +310,8 @@ class Page:
                 await connection.close(REFUSED, "the link is not the newest")
                 return
             self._clients.add(client)
-            tasks = [asyncio.create_task(each) for each in (self._send_pictures(client), self._send_status(client))]
+            sending = self._send_pictures, self._send_status, self._send_sentences
+            tasks = [asyncio.create_task(send(client)) for send in sending]
             try:
                 await self._listen(client)
             finally:
@@ -332,13 +342,16 @@ class Page:
             except BadMessageError as error:
                 await client.socket.close(TOO_MUCH, str(error))
                 return
-            if not client.may_send():
+            answers = isinstance(message, Drawn) and not client.drawn  # as often as there are pictures
+            stops = isinstance(message, Simple) and message.do == "stop"
+            if not (answers or stops or client.may_send()):
                 await client.socket.close(TOO_MUCH, "too many messages")
                 return
             try:
                 await self._obey(client, message)
             except CotargetError as error:
-                await client.socket.send(json.dumps({"say": str(error)}))
+                with suppress(asyncio.QueueFull):  # not sent from here: a stop does not wait for a slow line
+                    client.sentences.put_nowait(str(error))
 
     async def _obey(self, client: Client, message: Incoming) -> None:
         """Carry out a message.
@@ -398,6 +411,11 @@ class Page:
             }
             await client.socket.send(json.dumps(status))
             await asyncio.sleep(TICK_S)
+
+    async def _send_sentences(self, client: Client) -> None:
+        """Send why orders were refused."""
+        while True:
+            await client.socket.send(json.dumps({"say": await client.sentences.get()}))
 
     async def _send_pictures(self, client: Client) -> None:
         """Send the newest picture each time that the browser has drawn the last."""
