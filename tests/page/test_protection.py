@@ -312,7 +312,7 @@ def test_a_port_that_is_taken_is_refused_in_one_line(at):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", ""])
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "", "0", "0:0::0", "a..b"])
 def test_all_addresses_have_no_name_to_check(host):
     with pytest.raises(ConfigError, match="--page-host"):
         listen(host, 0)
