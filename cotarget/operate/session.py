@@ -260,7 +260,7 @@ class Session:
             wanted, self._to_record = self._to_record, None
         if wanted is None or self._records is None or wanted == bool(self._records.folder):
             return False
-        before = self._run.head.mode
+        before = self._run.head
         try:
             if not wanted:
                 self._records.end()
@@ -270,27 +270,27 @@ class Session:
             self.notice = str(error)
             return False
         order = Order("stand", HEAD)
-        if before is Mode.FOLLOWING:
-            u, v = (None, None) if step.target is None else step.target.center_px.tolist()
-            order = Order("follow", HEAD, click=None if u is None or v is None else (u, v))
+        if before.mode is Mode.FOLLOWING and before.selector is before.policy:
+            order = Order("follow", HEAD)
+        elif before.mode is Mode.FOLLOWING and step.target is not None:  # tracks have new numbers
+            u, v = step.target.center_px.tolist()
+            order = Order("follow", HEAD, click=(u, v))
         with self._lock:
             self._orders.insert(0, order)
         return True
 
     def _due(self) -> list[Order]:
         """Take the orders that the run obeys with the newest frame, and record them."""
-        clear = self._clear_file()
         there = self._look.reason() or self._rig.stopped
-        with self._lock:
+        with self._lock:  # a stop that comes meanwhile writes its file after that of the last was removed
             orders, self._orders = self._orders, []
             if any(each.kind == "stop" for each in orders):  # later than any Clear
                 orders = [each for each in orders if each.kind == "stop"]
-            elif clear:
+            elif self._to_clear and self._is_file_cleared():
                 orders, self.stopped = [Order("clear")], None
-            elif there is None:
-                self.stopped = None  # another program has cleared it
-            elif self.stopped is None:  # another program has stopped it
+            elif self.stopped is None and there is not None:  # by another program
                 orders, self.stopped = [Order("stop", reason=there)], there
+            self._to_clear = False
             if self.stopped is not None:
                 self._turning = {}
             orders += self._by_hand()
@@ -310,17 +310,15 @@ class Session:
                 orders.append(Order("stand", head))
         return orders
 
-    def _clear_file(self) -> bool:
-        """Remove the stop file if the stop is to be cleared; return whether it is."""
-        with self._lock:
-            clear, self._to_clear = self._to_clear, False
-        if clear and self._stop_file is not None:
-            try:
+    def _is_file_cleared(self) -> bool:
+        """Remove the stop file; return whether there is none now."""
+        try:
+            if self._stop_file is not None:
                 clear_stop_file(self._stop_file)
-            except CotargetError as error:
-                self.notice = str(error)
-                return False
-        return clear
+        except CotargetError as error:
+            self.notice = str(error)
+            return False
+        return True
 
     def _notice(self, step: Step) -> None:
         """Do as [follow] when_idle says once nothing was followed for long enough."""

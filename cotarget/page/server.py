@@ -310,10 +310,10 @@ class Page:
                 await connection.close(REFUSED, "the link is not the newest")
                 return
             self._clients.add(client)
-            sending = self._send_pictures, self._send_status, self._send_sentences
-            tasks = [asyncio.create_task(send(client)) for send in sending]
+            parts = self._listen, self._send_pictures, self._send_status, self._send_sentences
+            tasks = [asyncio.create_task(part(client)) for part in parts]
             try:
-                await self._listen(client)
+                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)  # a page in parts would look alive
             finally:
                 for task in tasks:
                     task.cancel()

@@ -133,6 +133,56 @@ def test_what_is_held_ends_when_the_page_loses_the_focus(browser, at):
     browser.key("ArrowUp", "keyUp")
 
 
+def test_what_is_held_during_a_stop_does_not_turn_after_clear(browser, at):
+    browser.js("document.querySelector('[data-rates]').focus()")
+    browser.key("Enter", "keyDown", text="\r")
+    until(lambda: noted(at, "manual"))
+    at.session.stopped = "from another page"
+    until(lambda: browser.text("word") == "Stopped")
+    count = len(noted(at, "manual"))
+    at.session.stopped = None
+    until(lambda: browser.text("word") != "Stopped")
+    time.sleep(0.5)
+    assert len(noted(at, "manual")) <= count + 1  # that was on its way
+    browser.key("Enter", "keyUp")
+
+
+def test_a_hold_that_has_ended_begins_with_a_new_press(browser, at):
+    browser.key("ArrowUp", "keyDown")
+    until(lambda: noted(at, "manual"))
+    browser.js("dispatchEvent(new Event('blur'))")
+    until(lambda: noted(at, "stand"))
+    count = len(noted(at, "manual"))
+    for _ in range(5):  # the key is still down, so that it repeats
+        browser.call("Input.dispatchKeyEvent", type="keyDown", key="ArrowUp", code="ArrowUp", autoRepeat=True)
+    time.sleep(0.3)
+    assert len(noted(at, "manual")) == count
+    browser.key("ArrowUp", "keyUp")
+
+
+def test_a_drag_that_has_ended_begins_with_a_new_press(browser, at):
+    x, y = browser.center("zoom")
+    browser.mouse("mousePressed", (x, y), button="left", clickCount=1)
+    browser.mouse("mouseMoved", (x + 100, y), button="left", buttons=1)
+    until(lambda: noted(at, "manual"))
+    browser.js("dispatchEvent(new Event('blur'))")
+    until(lambda: noted(at, "stand"))
+    count = len(noted(at, "manual"))
+    browser.mouse("mouseMoved", (x + 150, y), button="left", buttons=1)
+    time.sleep(0.3)
+    assert len(noted(at, "manual")) == count
+    browser.mouse("mouseReleased", (x + 150, y), button="left", clickCount=1)
+
+
+def test_pictures_that_stop_are_said_to_be_old(browser):
+    with served() as made:
+        browser.open(made.page.link)
+        until(lambda: browser.text("control") == "You have control.")
+        made.page.show(step(0, tracks=(TRACK,), reason=""), SPEC)
+        until(lambda: "No new picture" in browser.text("word"))
+        browser.open("about:blank")
+
+
 def test_a_click_follows_the_track_or_the_place(browser, at):
     browser.click("fixed", (100 / 640, 60 / 480))
     until(lambda: noted(at, "follow"))

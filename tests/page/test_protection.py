@@ -242,6 +242,14 @@ def test_a_flood_costs_its_socket_and_not_the_others(at):
         until(lambda: STOP in at.session.noted)
 
 
+def test_a_stop_is_counted_by_nobody(at):
+    with browser(at) as mine:
+        for _ in range(200):
+            say(mine, do="stop")
+        until(lambda: at.session.noted.count(STOP) == 200)
+        assert status(mine)["stopped"] == STOP[1]
+
+
 def test_sockets_are_not_compressed(at):
     with connect(f"ws://{LOOPBACK}:{at.port}/socket", origin=f"http://{LOOPBACK}:{at.port}") as socket:
         assert socket.response.headers.get("Sec-WebSocket-Extensions") is None
