@@ -32,7 +32,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
     about = "emulate head and zoom camera as one dome that is moved by this protocol (a PTU-D46 and a PowerShot)"
     parser.add_argument("--ptz", choices=("onvif", "visca"), help=about)
-    about = "what the dome does otherwise than the standard, by its names of the list of ptz faults below"
+    about = "how the dome deviates from its standard: faults of ptz, listed below, without ptz."
     parser.add_argument("--profile", type=lambda text: text.split(","), default=[], metavar="NAME[,NAME]", help=about)
     about = "units of a VISCA dome (ptzoptics)"
     parser.add_argument("--units", choices=("ptzoptics", "evi_d70", "evi_d80"), default="ptzoptics", help=about)
