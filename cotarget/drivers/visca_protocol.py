@@ -255,10 +255,10 @@ class Line:
         raise self._silent()
 
     def order(self, command: bytes, patience: float = TRIES * ANSWER_S, again_s: float = ANSWER_S) -> int:
-        """Send an order until it is acknowledged, each time with the same number; return the socket, 0 if unknown.
+        """Send an order until it is acknowledged, each time with a new number; return the socket, 0 if unknown.
 
         Args:
-            command: the order.
+            command: the order; one that may be executed twice.
             patience: for the acknowledgement [s].
             again_s: after this time without it the order is repeated [s].
 
@@ -266,31 +266,25 @@ class Line:
             RefusedError: the camera refuses the order; its `code` says why.
         """
         self._drain(0.0)
-        count, end, repeated = self._next(), self._clock.now() + patience, False
+        end, sent = self._clock.now() + patience, dict[int, float]()
         while True:
-            now = self._clock.now()
+            count, now = self._next(), self._clock.now()
+            sent[count] = now
             self._send(COMMAND, count, command)
             while (packet := self._receive(min(now + again_s, max(end, now + SLICE_S)))) is not None:
-                if self._is_abnormal(packet):
-                    if repeated:  # it has the order, and its acknowledgement was lost
-                        return 0
+                if self._is_abnormal(packet):  # of this message or another: no receipt in any case
                     self._reset()
-                    count = self._next()
                     break
-                answer = parse(packet.payload) if self._sent_of(packet, {count: now}) is not None else None
+                answer = parse(packet.payload) if self._sent_of(packet, sent) is not None else None
                 if answer is None or (answer.kind == 6 and answer.data[0] in (CANCELLED, NO_SOCKET)):
                     continue
                 if answer.kind == 6:
                     raise self._error(answer)
                 # A completion may be of an earlier order, unless its number says otherwise.
-                if answer.kind == 4 or (not answer.data and (packet.number == count or not answer.socket)):
+                if answer.kind == 4 or (not answer.data and (packet.number in sent or not answer.socket)):
                     self._answered = count
                     return answer.socket
-            else:
-                repeated = True
-            if self._clock.now() >= end:
-                raise self._silent()
-            if repeated and self.hurry() and command != STOP:
+            if self._clock.now() >= end or (self.hurry() and command != STOP):
                 raise self._silent()
 
     def patiently(self, command: bytes, proceed: Callable[[], None], before: int = 0) -> int:
