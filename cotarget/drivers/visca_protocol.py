@@ -35,6 +35,7 @@ DIGITAL_ZOOM_OFF = bytes.fromhex("81 01 04 06 03 FF")
 SOCKETS = (1, 2)  # of a camera, each for a command under way
 STANDBY = 3  # answer to POWER
 SYNTAX, BUFFER_FULL, CANCELLED, NO_SOCKET, NOT_EXECUTABLE = 0x02, 0x03, 0x04, 0x05, 0x41
+FOR_NOW = (BUFFER_FULL, NOT_EXECUTABLE)  # the same message may be obeyed a moment later
 ERRORS = {
     SYNTAX: "it does not know the command",
     BUFFER_FULL: "its command buffer is full",
@@ -226,14 +227,15 @@ class Line:
         """Send an inquiry; return the answer's data, and the time at which the camera read it [s].
 
         Raises:
-            RefusedError: the camera answers by an error; its `code` says which.
+            RefusedError: the camera answers by an error, to each try where it may be of now; its `code` says which.
         """
         sent: dict[int, float] = {}
+        silent = 0  # tries without an answer
         self._drain(0.0)
         for attempt in range(tries):
-            if attempt:
-                self._recover(attempt)
-            count = self._next()
+            if silent:
+                self._recover(silent)
+            count, refused = self._next(), None
             sent[count] = self._clock.now()
             self._send(INQUIRY, count, question)
             while (packet := self._receive(sent[count] + self._answer_s)) is not None:
@@ -243,16 +245,19 @@ class Line:
                     if self._is_abnormal(packet):
                         break
                     continue
-                if answer.kind == 6 and answer.data[0] not in (CANCELLED, NO_SOCKET):
-                    raise self._error(answer)
+                if answer.kind == 6 and not answer.socket:  # with a socket it is of an order
+                    refused = self._error(answer)
+                    if refused.code not in FOR_NOW:
+                        raise refused
                 if answer.kind == 5 and answer.data and _fits(question, answer.data):
                     self._answered, t = count, (begin + self._clock.now()) / 2
                     if attempt and not self.transport.header and self._drain(self._answer_s):
                         self._answer_s = min(2 * self._answer_s, SLOWEST_S)  # the first answer was late, and not lost
                     return answer.data, t
             if self.hurry():
-                break
-        raise self._silent()
+                raise self._silent()
+            silent = 0 if refused else silent + 1
+        raise refused or self._silent()
 
     def order(self, command: bytes, patience: float = TRIES * ANSWER_S, again_s: float = ANSWER_S) -> int:
         """Send an order until it is acknowledged, each time with a new number; return the socket, 0 if unknown.
@@ -303,7 +308,7 @@ class Line:
             try:
                 return self.order(command)
             except CodedError as error:
-                if error.code not in (BUFFER_FULL, NOT_EXECUTABLE) or self._clock.now() >= end:
+                if error.code not in FOR_NOW or self._clock.now() >= end:
                     raise
                 if error.code == BUFFER_FULL:
                     self.cancel((before,) if before else SOCKETS)

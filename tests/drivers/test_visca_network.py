@@ -1,6 +1,7 @@
 """The VISCA driver on a network that loses, delays and adds messages."""
 
 import contextlib
+import math
 import select
 import socket
 import threading
@@ -9,7 +10,7 @@ import pytest
 
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.head_link import Requests
-from cotarget.drivers.link_errors import SilentError
+from cotarget.drivers.link_errors import RefusedError, SilentError
 from cotarget.drivers.visca import ViscaLink
 from cotarget.drivers.visca_protocol import STOP
 from tests.support.plants import LiveDome, wait_for
@@ -19,7 +20,7 @@ GOAL, SPEEDS = (-2160, 0), (115.0, 115.0)  # counts, and counts/s: 150 degrees a
 PATIENCE_S = 5.0  # for a stop, on a busy machine
 LARGEST = 4096  # bytes
 CHECK_S = 0.05  # period of looking for the end of the relay
-HEADER = 8  # bytes
+HEADER, CAMERA_SAYS = 8, 0x90  # bytes of Sony's header; the first byte without it
 
 
 class Relay:
@@ -139,3 +140,47 @@ def test_a_late_refusal_of_an_earlier_number_is_no_receipt_of_a_stop():
 
         relay.to_camera = carry
         assert_halts(live, link)
+
+
+# Errors
+
+
+def with_header(like, payload):
+    """An answer with the header of another answer, if it has one."""
+    if like[0] == CAMERA_SAYS:
+        return payload
+    return like[:2] + len(payload).to_bytes(2, "big") + like[4:HEADER] + payload
+
+
+@pytest.mark.parametrize("protocol", ["sony", "udp"])
+def test_an_error_of_a_move_is_none_of_the_inquiry_during_which_it_comes(protocol):
+    with linked(protocol) as (live, relay, link):
+        live.pan.command(100, 1e6, math.inf)
+        wait_for(lambda: not live.turning())
+        relay.to_driver = lambda data: [with_header(data, bytes.fromhex("90 61 41 FF")), data]
+        pan, *_ = link.poll(Requests())
+        assert pan.position == 100
+
+
+@pytest.mark.parametrize("protocol", ["sony", "udp"])
+@pytest.mark.parametrize("code", ["03", "41"])
+def test_an_inquiry_that_is_refused_for_now_is_asked_again(protocol, code):
+    with linked(protocol) as (live, relay, link):
+        live.pan.command(100, 1e6, math.inf)
+        wait_for(lambda: not live.turning())
+        refusals = iter([bytes.fromhex(f"90 60 {code} FF")] * 2)
+
+        def refuse(data):
+            refusal = next(refusals, None)
+            return [with_header(data, refusal) if refusal else data]
+
+        relay.to_driver = refuse
+        pan, *_ = link.poll(Requests())
+        assert pan.position == 100
+
+
+def test_an_inquiry_that_is_refused_again_and_again_is_an_error():
+    with linked() as (_, relay, link):
+        relay.to_driver = lambda data: [with_header(data, bytes.fromhex("90 60 41 FF"))]
+        with pytest.raises(RefusedError, match="it cannot do that now"):
+            link.poll(Requests())
