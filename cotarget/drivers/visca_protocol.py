@@ -14,6 +14,7 @@ Sources: Sony's EVI-D70 and EVI-D80/D90 technical manuals; Sony's VISCA over IP,
 import errno
 import select
 import socket
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -126,6 +127,11 @@ def parse(message: bytes) -> Answer | None:
     return Answer(kind, place, message[2:-1])
 
 
+def _is_receipt(answer: Answer) -> bool:
+    """Whether an answer is the first one to an order; a completion with a socket follows an acknowledgement."""
+    return answer.kind == 4 or (answer.kind == 5 and not answer.data and not answer.socket)
+
+
 # Sony's header
 
 COMMAND, INQUIRY, REPLY, CONTROL, CONTROL_REPLY = 0x0100, 0x0110, 0x0111, 0x0200, 0x0201  # types of payloads
@@ -222,6 +228,7 @@ class Line:
         self._most: int | None = None  # highest number that the camera answers after a reset; None for all
         self._repeats_numbers = True  # whether answers have the number of their message
         self._other: int | None = None  # number of the last answer with another one
+        self._pending = deque[float]()  # when the orders were sent that have had no receipt or refusal [s]
 
     def inquire(self, question: bytes, tries: int = TRIES) -> tuple[bytes, float]:
         """Send an inquiry; return the answer's data, and the time at which the camera read it [s].
@@ -272,10 +279,12 @@ class Line:
         """
         self._drain(0.0)
         end, sent = self._clock.now() + patience, dict[int, float]()
+        earlier = self._unacknowledged()
         while True:
             count, now = self._next(), self._clock.now()
             sent[count] = now
             self._send(COMMAND, count, command)
+            self._pending.append(now)
             while (packet := self._receive(min(now + again_s, max(end, now + SLICE_S)))) is not None:
                 if self._is_abnormal(packet):  # of this message or another: no receipt in any case
                     self._reset()
@@ -284,9 +293,14 @@ class Line:
                 if answer is None or (answer.kind == 6 and answer.data[0] in (CANCELLED, NO_SOCKET)):
                     continue
                 if answer.kind == 6:
+                    if self._pending and not answer.socket:
+                        self._pending.popleft()
                     raise self._error(answer)
                 # A completion may be of an earlier order, unless its number says otherwise.
-                if answer.kind == 4 or (not answer.data and (packet.number in sent or not answer.socket)):
+                if _is_receipt(answer) or (not answer.data and packet.number in sent):
+                    if earlier:  # the order is sent again at once, and one more receipt waited for
+                        earlier -= 1
+                        break
                     self._answered = count
                     return answer.socket
             if self._clock.now() >= end or (self.hurry() and command != STOP):
@@ -387,6 +401,12 @@ class Line:
         self._other = packet.number
         return max(sent.values()) if packet.number is None or not self._repeats_numbers else None
 
+    def _unacknowledged(self) -> int:
+        """Return how many acknowledgements of earlier orders may still come, which nothing tells from later ones."""
+        while self._pending and self._pending[0] < self._clock.now() - self._answer_s:
+            self._pending.popleft()
+        return 0 if self.transport.header and self._repeats_numbers else len(self._pending)
+
     def _is_abnormal(self, packet: Packet) -> bool:
         return packet.kind == CONTROL_REPLY and packet.payload == ABNORMAL_NUMBER
 
@@ -431,7 +451,7 @@ class Line:
             if (packet := unpack(data)) is None:
                 self.heard = data
             else:
-                self._inbox.append(packet)
+                self._take(packet)
             return
         if not data and self.transport.kind == socket.SOCK_STREAM:
             closed = ConnectionResetError(errno.ECONNRESET, "it closes the connection, as to a second program")
@@ -442,8 +462,14 @@ class Line:
             if parse(message + bytes([END])) is None:
                 self.heard = message
             else:
-                self._inbox.append(Packet(REPLY, None, message + bytes([END])))
+                self._take(Packet(REPLY, None, message + bytes([END])))
         self.heard = rest or self.heard
+
+    def _take(self, packet: Packet) -> None:
+        self._inbox.append(packet)
+        answer = parse(packet.payload) if packet.kind == REPLY else None
+        if answer is not None and _is_receipt(answer) and self._pending:
+            self._pending.popleft()
 
     def _drain(self, quiet_s: float) -> int:
         """Drop what comes within a time [s]; return the number of answers to inquiries in it."""

@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.head_link import Requests
+from cotarget.drivers.head_link import DroppedError, Halt, Requests
 from cotarget.drivers.link_errors import RefusedError, SilentError
 from cotarget.drivers.visca import ViscaLink
 from cotarget.drivers.visca_protocol import STOP
@@ -136,6 +136,31 @@ def test_a_late_refusal_of_an_earlier_number_is_no_receipt_of_a_stop():
             stops.append(data)
             if len(stops) == 2:
                 relay.answer(bytes.fromhex("02 01 00 02 00 00 00 02 0F 01"))
+            return []
+
+        relay.to_camera = carry
+        assert_halts(live, link)
+
+
+@pytest.mark.parametrize(("protocol", "fault"), [("udp", None), ("sony", "constant-number")])
+def test_a_late_acknowledgement_of_a_move_is_none_of_the_stop(protocol, fault):
+    """A halt interrupts a move; the stop is lost, and only then comes the acknowledgement of the move."""
+    with linked(protocol, fault) as (live, relay, link):
+        held = []
+        relay.to_driver = lambda data: held.append(data) or []
+        requests = Requests()
+        requests.add(requests.halts, Halt(1))
+        with pytest.raises(DroppedError):
+            link.move(GOAL, SPEEDS, requests)
+        wait_for(live.turning)
+        wait_for(lambda: held)
+
+        def carry(data):
+            if not (data.endswith(STOP) and held):
+                return [data]
+            relay.to_driver = lambda data: [data]
+            while held:
+                relay.answer(held.pop(0))
             return []
 
         relay.to_camera = carry
