@@ -12,12 +12,14 @@ Sources: ONVIF PTZ Service Specification 23.12, Media Service Specification, Cor
 
 import contextlib
 import math
+import queue
 import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from concurrent.futures import TimeoutError as NotDoneError
 from dataclasses import dataclass
+from functools import partial
 from os import environ
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -60,6 +62,7 @@ STILL_S = 0.3  # whether a device says that it moves cannot be believed; it stan
 BLIND_S = 0.5  # positions are reckoned where the device has said none for this time [s]
 LATEST_S = 0.02  # a status that takes longer is of its end [s]
 TIMEOUT_S = 1.0  # a continuous move ends by itself after this time, where the device can that [s]
+WORKERS = 8  # commands that may be under way at the same time
 FINE = 0.02  # velocities are sent again where they change by more, as a share of the highest
 ZOOM_STEPS = 1000  # in which the range of the zoom's number is divided
 ZOOM_SLACK = 0.01  # of that range, by which the reported number may be off
@@ -403,6 +406,36 @@ class StatusReader:
                     return
 
 
+class Workers:
+    """Run functions on daemon threads, also at the end of the program, when an executor takes none any more."""
+
+    def __init__(self) -> None:
+        self._calls = queue.SimpleQueue[tuple[Future[None], Callable[[], None]] | None]()
+        for _ in range(WORKERS):  # from the start, because no thread starts at the end of the program
+            threading.Thread(target=self._run, name="onvif command", daemon=True).start()
+
+    def submit(self, act: Callable[[], None]) -> Future[None]:
+        """Run a function; the future has its error."""
+        done = Future[None]()
+        self._calls.put((done, act))
+        return done
+
+    def close(self) -> None:
+        """Let the threads end, each after the function that it runs."""
+        for _ in range(WORKERS):
+            self._calls.put(None)
+
+    def _run(self) -> None:
+        while (call := self._calls.get()) is not None:
+            done, act = call
+            try:
+                act()
+            except BaseException as error:
+                done.set_exception(error)
+            else:
+                done.set_result(None)
+
+
 class OnvifLink(PtzLink):
     """The protocol of a camera that ONVIF moves; the camera was only asked.
 
@@ -433,7 +466,7 @@ class OnvifLink(PtzLink):
             self._seen, self._heard = status, clock.now()
             self.identity = self._describe(status)
             self._goals: tuple[float | None, float | None, float | None] = self._positions(status)
-            self._workers = ThreadPoolExecutor(4, "onvif command")
+            self._workers = Workers()
             self._sent = Future[None]()  # of the newest command
             self._sent.set_result(None)
             self._reader = StatusReader(device.status, status)
@@ -488,7 +521,7 @@ class OnvifLink(PtzLink):
     def close(self) -> None:
         """Release the connections; never raises."""
         self._reader.close()
-        self._workers.shutdown(wait=False)
+        self._workers.close()
         self._device.soap.close()
 
     # What the device is
@@ -641,7 +674,7 @@ class OnvifLink(PtzLink):
         if self._device.abilities.space("ContinuousPanTiltVelocitySpace"):
             orders.append(("ContinuousMove", f"<Velocity>{vector(0.0, 0.0, zoom)}</Velocity>"))
         while True:
-            answers = [self._workers.submit(self._device.command, *order, STOP_S) for order in orders]
+            answers = [self._workers.submit(partial(self._device.command, *order, STOP_S)) for order in orders]
             errors = [error for answer in answers if (error := answer.exception()) is not None]
             if len(errors) < len(orders):
                 now = self._clock.now()
@@ -665,7 +698,7 @@ class OnvifLink(PtzLink):
 
     def _send(self, message: str, inner: str, requests: Requests) -> None:
         """Send a command; give up waiting for its answer where a halt waits."""
-        self._sent = self._workers.submit(self._device.command, message, inner)
+        self._sent = self._workers.submit(partial(self._device.command, message, inner))
         while True:
             try:
                 self._sent.result(timeout=LOOK_S)

@@ -4,6 +4,8 @@ import contextlib
 import dataclasses
 import math
 import re
+import subprocess
+import sys
 import threading
 import time
 
@@ -123,6 +125,30 @@ def test_closing_and_an_error_of_the_caller_leave_the_head_at_rest():
         time.sleep(SETTLED_S)
         assert not unit.turning()
         assert unit.pan.degrees() < 120.0
+
+
+LEFT_TURNING = """
+import contextlib, math
+from cotarget.config import SafetyConfig
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.onvif import OnvifDome, OnvifSettings
+
+dome = OnvifDome({settings!r}, MonotonicClock(), SafetyConfig(stop_file=None))
+dome.head.move(math.radians(140.0), 0.0, speed=math.radians(20.0))
+while dome.head.state().pan < math.radians(3.0):
+    pass
+{end}
+"""
+
+
+@pytest.mark.parametrize("end", ["", "raise ValueError"])
+def test_a_program_that_ends_without_closing_leaves_the_head_at_rest(end):
+    with OnvifUnit() as unit:
+        script = LEFT_TURNING.format(settings=unit.settings, end=end)
+        subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=60.0, check=False)
+        time.sleep(SETTLED_S)
+        assert not unit.turning()
+        assert 3.0 < unit.pan.degrees() < 120.0
 
 
 def test_a_status_that_blocks_delays_no_halt():
