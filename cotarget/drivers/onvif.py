@@ -495,7 +495,7 @@ class OnvifLink(PtzLink):
                 axis.aim(goal, speed, now)
             self._steer(requests)
             return
-        zoom = self._goals[2] if self._settings.all_axes else None
+        zoom = self._goal_or_place(2, now) if self._settings.all_axes else None
         fastest = self._settings.speed_deg_s
         self._absolute(goals, zoom, tuple(min(speed / fastest, 1.0) for speed in speeds), requests)
         for reckoned, goal, speed in zip(self._reckoned[:2], goals, speeds, strict=True):
@@ -503,11 +503,11 @@ class OnvifLink(PtzLink):
 
     def zoom(self, position: float, requests: Requests) -> None:
         """Send the lens to a position."""
-        self._goals = (*self._goals[:2], position)
-        pan, tilt, _ = self._goals
-        both = (pan, tilt) if self._settings.all_axes and pan is not None and tilt is not None else None
+        self._goals, now = (*self._goals[:2], position), self._clock.now()
+        all_axes = self._settings.all_axes and not self._is_steered
+        both = (self._goal_or_place(0, now), self._goal_or_place(1, now)) if all_axes else None
         self._absolute(both, position, None, requests)
-        self._reckoned[2].command(position, self.axes[2].fastest, self._clock.now())
+        self._reckoned[2].command(position, self.axes[2].fastest, now)
 
     def halt(self, patience: float) -> None:
         """Stop pan and tilt; once more when a command that was given up is answered, since it may move them later."""
@@ -638,6 +638,12 @@ class OnvifLink(PtzLink):
 
     # Commands
 
+    def _goal_or_place(self, axis: int, now: float) -> float:
+        """Return an axis's goal; where it has none, as after a halt, the position where it stands."""
+        place = self._positions(self._seen)[axis]
+        goal = self._goals[axis] if self._goals[axis] is not None else place
+        return self._reckoned[axis].at(now)[0] if goal is None else goal
+
     def _steer(self, requests: Requests) -> None:
         """Send the velocities that lead to the goals, where they change, or before the device ends them by itself."""
         now = self._clock.now()
@@ -653,8 +659,8 @@ class OnvifLink(PtzLink):
         due = any(wanted) and now - self._renewed > (self._timeout_s or TIMEOUT_S) / 2
         if same and not due:
             return
-        zoom = 0.0 if self._settings.all_axes else None
-        velocity = f"<Velocity>{vector(wanted[0] / fastest, wanted[1] / fastest, zoom)}</Velocity>"
+        # A zoom of 0 would stop the lens.
+        velocity = f"<Velocity>{vector(wanted[0] / fastest, wanted[1] / fastest, None)}</Velocity>"
         timeout = f"<Timeout>PT{self._timeout_s:g}S</Timeout>" if self._timeout_s else ""
         try:
             self._send("ContinuousMove", velocity + timeout, requests)
@@ -669,10 +675,9 @@ class OnvifLink(PtzLink):
 
     def _stop(self, deadline: float) -> None:
         """Stop by a stop and by velocities of zero, since devices may ignore one; repeat both until one is answered."""
-        zoom = 0.0 if self._settings.all_axes else None
         orders = [("Stop", "<PanTilt>true</PanTilt><Zoom>false</Zoom>")]
         if self._device.abilities.space("ContinuousPanTiltVelocitySpace"):
-            orders.append(("ContinuousMove", f"<Velocity>{vector(0.0, 0.0, zoom)}</Velocity>"))
+            orders.append(("ContinuousMove", f"<Velocity>{vector(0.0, 0.0, None)}</Velocity>"))
         while True:
             answers = [self._workers.submit(partial(self._device.command, *order, STOP_S)) for order in orders]
             errors = [error for answer in answers if (error := answer.exception()) is not None]

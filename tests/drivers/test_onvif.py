@@ -15,6 +15,7 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers import onvif
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.onvif import OnvifDome, OnvifLink
+from cotarget.emulators.onvif import ANSWERS, TPTZ
 from cotarget.errors import ConfigError, CotargetError
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
 from tests.support.plants import PASSWORD, fails, wait_for
@@ -95,6 +96,45 @@ def test_a_device_that_takes_a_missing_axis_as_zero_gets_all_of_them():
         dome.head.move(math.radians(25.0), math.radians(15.0), wait=True)
         assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((25.0, 15.0), abs=NEAR_DEG)
         assert unit.lens.position() == unit.lens.last
+
+
+def test_a_zoom_of_all_axes_after_opening_and_after_a_halt_moves_the_lens_alone():
+    with OnvifUnit("missing-is-zero") as unit:
+        unit.pan.command(round(-40.0 / STEP_DEG), 1e5, 1e6)
+        wait_for(lambda: unit.pan.degrees() == pytest.approx(-40.0))
+        with opened(unit, all_axes=True) as dome:
+            dome.zoom.zoom(dome.zoom.focal_range[1])
+            wait_for(lambda: unit.lens.position() == unit.lens.last)
+            time.sleep(SETTLED_S)
+            assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((-40.0, 0.0), abs=NEAR_DEG)
+            dome.head.move(math.radians(140.0), 0.0, speed=math.radians(40.0))
+            wait_for(lambda: unit.pan.degrees() > -30.0)
+            dome.head.halt()
+            wait_for(lambda: not dome.head.state().moving)
+            halted = unit.pan.degrees()
+            dome.zoom.zoom(dome.zoom.focal_range[0])
+            wait_for(lambda: unit.lens.position() == 0)
+            time.sleep(SETTLED_S)
+            assert unit.pan.degrees() == pytest.approx(halted, abs=NEAR_DEG)
+
+
+def test_velocities_leave_the_lens_alone_and_a_zoom_leaves_a_steered_head_alone(monkeypatch):
+    with OnvifUnit("continuous-only") as unit, opened(unit, all_axes=True) as dome:
+        asked = []
+        answer = ANSWERS[TPTZ, "ContinuousMove"]
+        monkeypatch.setitem(
+            ANSWERS,
+            (TPTZ, "ContinuousMove"),
+            lambda *about: (asked.append(about[2].vector("Velocity")), answer(*about))[1],
+        )
+        dome.head.move(math.radians(10.0), 0.0)
+        dome.zoom.zoom(dome.zoom.focal_range[1])
+        wait_for(lambda: unit.lens.position() == unit.lens.last)
+        dome.head.move(math.radians(10.0), 0.0, wait=True)
+        dome.head.halt()
+        assert asked
+        assert all(zoom is None for _, _, zoom in asked)
+        wait_for(lambda: not dome.zoom.state().moving)
 
 
 # Halts
