@@ -11,6 +11,8 @@ import base64
 import contextlib
 import hashlib
 import os
+import socket
+import struct
 import time
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
@@ -36,6 +38,8 @@ LONGEST_ANSWER = 1 << 20  # [bytes]; the longest list of profiles has a tenth
 LONGEST_QUOTE = 100  # of a device's text in a message [characters]
 CLOCK_S = 5.0  # a clock that is off by more is named in messages [s]
 NOT_AUTHORIZED = "NotAuthorized"
+# A command that was given up is discarded with its connection; else the system repeats it, and it may follow the stop.
+DISCARD = (socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 class FaultError(DeviceError):
@@ -168,7 +172,10 @@ class SoapClient:
         scheme = "https" if address.endswith(":443") else "http"
         auth = self._httpx.DigestAuth(user, password) if user else None
         # Cameras sign their certificates themselves. Proxies and logins of the environment do not apply to them.
-        self._client = self._httpx.Client(base_url=f"{scheme}://{address}", auth=auth, verify=False, trust_env=False)
+        transport = self._httpx.HTTPTransport(verify=False, trust_env=False, socket_options=[DISCARD])
+        self._client = self._httpx.Client(
+            base_url=f"{scheme}://{address}", auth=auth, transport=transport, trust_env=False
+        )
         self._offset_s: float | None = None  # of the device's clock
         self._date: datetime | None = None  # in the header of the newest answer
 

@@ -1,14 +1,17 @@
 """SOAP of ONVIF by hand: XML, the user's token, faults, durations and spaces."""
 
 import base64
+import contextlib
 import hashlib
+import socket
 from datetime import UTC, datetime
 from xml.etree.ElementTree import fromstring
 
 import pytest
 
+from cotarget.drivers.link_errors import SilentError
 from cotarget.drivers.onvif import Coordinate, Range, abilities_of, seconds, status_of, vector
-from cotarget.drivers.soap import device_time, fault_of, find, parse_xml, text_at, user_token
+from cotarget.drivers.soap import SoapClient, device_time, fault_of, find, parse_xml, text_at, user_token
 from cotarget.emulators.onvif import BOMB
 
 TT = "http://www.onvif.org/ver10/schema"
@@ -134,3 +137,24 @@ def test_elements_are_found_in_any_namespace():
     assert text_at(root, "Body/a/b") == "c"
     assert find(root, "Body/b") is None
     assert text_at(None, "a") == ""
+
+
+# The client
+
+
+@contextlib.contextmanager
+def listening():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.settimeout(10.0)
+        with contextlib.closing(SoapClient(f"127.0.0.1:{listener.getsockname()[1]}")) as client:
+            yield listener, client
+
+
+def test_a_command_that_was_given_up_is_discarded_with_its_connection():
+    """A reset says so; after an orderly end the system would go on sending what has not arrived."""
+    with listening() as (listener, client):
+        with pytest.raises(SilentError):
+            client.call("/", "x", "AbsoluteMove", timeout=0.2)
+        connection, _ = listener.accept()
+        with connection, pytest.raises(ConnectionResetError):
+            b"".join(iter(lambda: connection.recv(1000), b""))
