@@ -27,7 +27,7 @@ from xml.etree.ElementTree import Element
 
 from cotarget.drivers.axes import AxisFacts, Poll
 from cotarget.drivers.head_link import Pair, Requests
-from cotarget.drivers.link_errors import RefusedError, SilentError
+from cotarget.drivers.link_errors import RefusedError
 from cotarget.drivers.ptz import Dome, PtzLink, PtzSettings
 from cotarget.drivers.soap import (
     DEVICE,
@@ -674,23 +674,30 @@ class OnvifLink(PtzLink):
             axis.send(speed, now)
 
     def _stop(self, deadline: float) -> None:
-        """Stop by a stop and by velocities of zero, since devices may ignore one; repeat both until one is answered."""
+        """Stop by a stop and by velocities of zero, since devices may ignore one; repeat each until it is answered."""
         orders = [("Stop", "<PanTilt>true</PanTilt><Zoom>false</Zoom>")]
         if self._device.abilities.space("ContinuousPanTiltVelocitySpace"):
             orders.append(("ContinuousMove", f"<Velocity>{vector(0.0, 0.0, None)}</Velocity>"))
-        while True:
+        faults, count = list[BaseException](), len(orders)
+        while orders:
             answers = [self._workers.submit(partial(self._device.command, *order, STOP_S)) for order in orders]
-            errors = [error for answer in answers if (error := answer.exception()) is not None]
-            if len(errors) < len(orders):
-                now = self._clock.now()
-                for steered in self._steered:
-                    steered.stop(now)
-                for reckoned in self._reckoned[:2]:
-                    reckoned.halt(now)
-                return
-            if self._clock.now() > deadline or not any(isinstance(error, SilentError) for error in errors):
-                why = f"; {RIGHTS}" if isinstance(errors[0], LoginFaultError) else ""
-                raise DeviceError(f"{self.name} does not stop: {errors[0]}{why}") from errors[0]
+            wait(answers, STOP_S + LOOK_S)
+            errors = [answer.exception() if answer.done() else NotDoneError("no whole answer") for answer in answers]
+            faults += [error for error in errors if isinstance(error, FaultError)]
+            silent = [error for error in errors if error is not None and not isinstance(error, FaultError)]
+            if silent and self._clock.now() > deadline:
+                raise DeviceError(f"{self.name} does not stop: {silent[0]}") from silent[0]
+            orders = [order for order, error in zip(orders, errors, strict=True) if error in silent]
+            if silent:
+                self._clock.sleep_until(self._clock.now() + LOOK_S)  # a refused connection takes no time
+        if len(faults) == count:
+            why = f"; {RIGHTS}" if isinstance(faults[0], LoginFaultError) else ""
+            raise DeviceError(f"{self.name} does not stop: {faults[0]}{why}") from faults[0]
+        now = self._clock.now()
+        for steered in self._steered:
+            steered.stop(now)
+        for reckoned in self._reckoned[:2]:
+            reckoned.halt(now)
 
     def _absolute(
         self, goals: Pair | None, zoom: float | None, speeds: tuple[float, ...] | None, requests: Requests

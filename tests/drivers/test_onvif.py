@@ -23,6 +23,8 @@ from tests.support.plants import PASSWORD, fails, wait_for
 pytestmark = pytest.mark.wire
 SAFETY = SafetyConfig(stop_file=None)
 NEAR_DEG = 2 * STEP_DEG
+LOST_S = 0.7  # longer than a stop waits for its answer
+AWAY_S = 0.25
 SETTLED_S = 0.5  # of a halt's answer and of braking from the highest speed
 
 
@@ -189,6 +191,41 @@ def test_a_program_that_ends_without_closing_leaves_the_head_at_rest(end):
         time.sleep(SETTLED_S)
         assert not unit.turning()
         assert 3.0 < unit.pan.degrees() < 120.0
+
+
+def test_a_stop_is_repeated_until_the_zero_velocity_is_answered_too(monkeypatch):
+    """The first one is lost, at a device that ignores the order named Stop."""
+    with OnvifUnit("continuous-only", "stop-ignored", "timeout-ignored") as unit, opened(unit) as dome:
+        answer, lost = ANSWERS[TPTZ, "ContinuousMove"], []
+
+        def lose_first(camera, faults, message):
+            if message.vector("Velocity")[:2] == (0.0, 0.0) and not lost:
+                lost.append(message)
+                time.sleep(LOST_S)
+                return ""
+            return answer(camera, faults, message)
+
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(20.0))
+        wait_for(lambda: unit.pan.degrees() > 3.0)
+        monkeypatch.setitem(ANSWERS, (TPTZ, "ContinuousMove"), lose_first)
+        dome.head.halt()
+        time.sleep(SETTLED_S)
+        assert lost
+        assert not unit.turning()
+
+
+def test_a_device_that_takes_no_connection_for_a_moment_is_stopped_all_the_same():
+    with OnvifUnit() as unit, opened(unit) as dome:
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(20.0))
+        wait_for(lambda: unit.pan.degrees() > 3.0)
+        unit.server.close()
+        back = threading.Timer(AWAY_S, unit.listen, (unit.server.port,))
+        back.start()
+        dome.head.halt()
+        back.join()
+        time.sleep(SETTLED_S)
+        assert not unit.turning()
+        assert unit.pan.degrees() < 120.0
 
 
 def test_a_status_that_blocks_delays_no_halt():

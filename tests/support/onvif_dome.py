@@ -52,7 +52,9 @@ class OnvifUnit:
             self.stream = opened.enter_context(RtspServer(stream, host=host, faults=faults, **self._user))
             model = OnvifModel(PAN_DEG, TILT_DEG, STEP_DEG, SPEED_DEG_S, 400.0, self.stream.url, FEED_SIZE)
             self.camera = OnvifCamera(self.pan, self.tilt, self.lens, model, self.faults)
-            self.server = opened.enter_context(OnvifServer(self.camera, host=host, faults=self.faults, **self._user))
+            self._host = host
+            opened.callback(lambda: self.server.close())
+            self.listen()
             self._opened = opened.pop_all()
         self.settings = OnvifSettings(
             host=self.server.host,
@@ -66,6 +68,10 @@ class OnvifUnit:
             lens=((0.0, 1.0), (1.0, 10.0)),
             **self._user,
         )
+
+    def listen(self, port=0):
+        """Open the server at a port, after the last one was closed."""
+        self.server = OnvifServer(self.camera, host=self._host, port=port, faults=self.faults, **self._user)
 
     def __enter__(self):
         return self
