@@ -170,12 +170,10 @@ class SoapClient:
         self.name, self._user, self._password, self._remedy = f"the device at {address}", user, password, remedy
         self._httpx = import_httpx()
         scheme = "https" if address.endswith(":443") else "http"
-        auth = self._httpx.DigestAuth(user, password) if user else None
+        self._auth = self._httpx.DigestAuth(user, password) if user else self._httpx.Auth()
         # Cameras sign their certificates themselves. Proxies and logins of the environment do not apply to them.
         transport = self._httpx.HTTPTransport(verify=False, trust_env=False, socket_options=[DISCARD])
-        self._client = self._httpx.Client(
-            base_url=f"{scheme}://{address}", auth=auth, transport=transport, trust_env=False
-        )
+        self._client = self._httpx.Client(base_url=f"{scheme}://{address}", transport=transport, trust_env=False)
         self._offset_s: float | None = None  # of the device's clock
         self._date: datetime | None = None  # in the header of the newest answer
 
@@ -250,14 +248,18 @@ class SoapClient:
             f'<{message} xmlns="{namespace}" xmlns:t="{SCHEMA}">{inner}</{message}></s:Body></s:Envelope>'
         )
         kind = f'application/soap+xml; charset=utf-8; action="{namespace}/{message}"'
-        limits = httpx.Timeout(max(deadline - time.monotonic(), 0.05), connect=CONNECT_S)
         with self._one_line_errors(message):
-            request = self._client.build_request(
-                "POST", path, content=data.encode(), headers={"Content-Type": kind}, timeout=limits
-            )
-            response = self._client.send(request, stream=True)
-            with contextlib.closing(response):
-                said = self._read(response, message, deadline)
+            request = self._client.build_request("POST", path, content=data.encode(), headers={"Content-Type": kind})
+            steps = self._auth.sync_auth_flow(request)
+            with contextlib.suppress(StopIteration):
+                request = next(steps)
+                while True:  # here, since the client would read the answer to a refused request without our limits
+                    left_s = max(deadline - time.monotonic(), 0.05)
+                    request.extensions["timeout"] = httpx.Timeout(left_s, connect=min(CONNECT_S, left_s)).as_dict()
+                    response = self._client.send(request, stream=True)
+                    with contextlib.closing(response):
+                        said = self._read(response, message, deadline)
+                    request = steps.send(response)
         self._date = _date(response.headers)
         if response.status_code == 401 and not said.strip().startswith(b"<"):
             raise LoginFaultError(self.name, message, (NOT_AUTHORIZED,), "HTTP status 401")

@@ -4,6 +4,8 @@ import base64
 import contextlib
 import hashlib
 import socket
+import threading
+import time
 from datetime import UTC, datetime
 from xml.etree.ElementTree import fromstring
 
@@ -13,6 +15,7 @@ from cotarget.drivers.link_errors import SilentError
 from cotarget.drivers.onvif import Coordinate, Range, abilities_of, seconds, status_of, vector
 from cotarget.drivers.soap import SoapClient, device_time, fault_of, find, parse_xml, text_at, user_token
 from cotarget.emulators.onvif import BOMB
+from cotarget.errors import DeviceError
 
 TT = "http://www.onvif.org/ver10/schema"
 
@@ -143,10 +146,10 @@ def test_elements_are_found_in_any_namespace():
 
 
 @contextlib.contextmanager
-def listening():
+def listening(*user):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         listener.settimeout(10.0)
-        with contextlib.closing(SoapClient(f"127.0.0.1:{listener.getsockname()[1]}")) as client:
+        with contextlib.closing(SoapClient(f"127.0.0.1:{listener.getsockname()[1]}", *user)) as client:
             yield listener, client
 
 
@@ -158,3 +161,40 @@ def test_a_command_that_was_given_up_is_discarded_with_its_connection():
         connection, _ = listener.accept()
         with connection, pytest.raises(ConnectionResetError):
             b"".join(iter(lambda: connection.recv(1000), b""))
+
+
+def test_a_connection_takes_no_longer_than_the_answer_may():
+    """One that nothing takes: the queue of the listener is full."""
+    with contextlib.ExitStack() as opened:
+        listener = opened.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
+        for _ in range(4):
+            waiting = opened.enter_context(socket.socket())
+            waiting.setblocking(False)
+            waiting.connect_ex(listener.getsockname())
+        client = opened.enter_context(contextlib.closing(SoapClient(f"127.0.0.1:{listener.getsockname()[1]}")))
+        begin = time.monotonic()
+        with pytest.raises(DeviceError, match="does not answer"):
+            client.call("/", "x", "Stop", timeout=0.3)
+        assert time.monotonic() - begin < 1.0
+
+
+def test_a_refused_request_is_read_with_the_limits_of_any_other():
+    """An answer that comes piece by piece for 5 s."""
+
+    def serve(listener):
+        connection, _ = listener.accept()
+        with connection, contextlib.suppress(OSError):
+            connection.recv(10_000)
+            connection.sendall(b'HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: Digest realm="r", nonce="n"\r\n\r\n')
+            for _ in range(50):
+                connection.sendall(b"<p>")
+                time.sleep(0.1)
+
+    with listening("root", "wrong") as (listener, client):
+        thread = threading.Thread(target=serve, args=(listener,))
+        thread.start()
+        begin = time.monotonic()
+        with pytest.raises(SilentError):
+            client.call("/", "x", "Stop", timeout=0.5)
+        assert time.monotonic() - begin < 2.0
+        thread.join()
