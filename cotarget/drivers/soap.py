@@ -261,11 +261,11 @@ class SoapClient:
                         said = self._read(response, message, deadline)
                     request = steps.send(response)
         self._date = _date(response.headers)
-        if response.status_code == 401 and not said.strip().startswith(b"<"):
-            raise LoginFaultError(self.name, message, (NOT_AUTHORIZED,), "HTTP status 401")
         try:
             root = parse_xml(said)
         except ValueError as error:
+            if response.status_code == 401:
+                raise LoginFaultError(self.name, message, (NOT_AUTHORIZED,), "HTTP status 401") from None
             what = f"HTTP status {response.status_code}" if response.status_code != 200 else f"no SOAP ({error})"
             raise DeviceError(
                 f"{self.name} answers {message} by {what}: check that ONVIF is on, and host and port"

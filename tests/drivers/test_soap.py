@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import hashlib
+import http.server
 import socket
 import threading
 import time
@@ -13,9 +14,19 @@ import pytest
 
 from cotarget.drivers.link_errors import SilentError
 from cotarget.drivers.onvif import Coordinate, Range, abilities_of, seconds, status_of, vector
-from cotarget.drivers.soap import SoapClient, device_time, fault_of, find, parse_xml, text_at, user_token
+from cotarget.drivers.soap import (
+    LoginFaultError,
+    SoapClient,
+    device_time,
+    fault_of,
+    find,
+    parse_xml,
+    text_at,
+    user_token,
+)
 from cotarget.emulators.onvif import BOMB
 from cotarget.errors import DeviceError
+from tests.support.loopback import Loopback
 
 TT = "http://www.onvif.org/ver10/schema"
 
@@ -153,6 +164,31 @@ def listening(*user):
             yield listener, client
 
 
+class _Server(Loopback, http.server.ThreadingHTTPServer):
+    answer = None
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    def do_POST(self):
+        asked = self.rfile.read(int(self.headers["Content-Length"])).decode()
+        status, page = self.server.answer(asked)
+        self.send_response(status)
+        self.end_headers()
+        self.wfile.write(page.encode())
+
+    def log_message(self, *_):
+        pass
+
+
+@contextlib.contextmanager
+def answering(answer, *user):
+    """A client of a device that answers an envelope by a status and a page."""
+    with _Server(("127.0.0.1", 0), _Handler) as server:
+        server.answer = answer
+        with contextlib.closing(SoapClient(f"127.0.0.1:{server.server_address[1]}", *user)) as client:
+            yield client
+
+
 def test_a_command_that_was_given_up_is_discarded_with_its_connection():
     """A reset says so; after an orderly end the system would go on sending what has not arrived."""
     with listening() as (listener, client):
@@ -198,3 +234,15 @@ def test_a_refused_request_is_read_with_the_limits_of_any_other():
             client.call("/", "x", "Stop", timeout=0.5)
         assert time.monotonic() - begin < 2.0
         thread.join()
+
+
+@pytest.mark.parametrize(
+    "page", ["", "<!DOCTYPE html><html><p>Unauthorized<br></html>", "<html><p>Unauthorized</html>"]
+)
+def test_a_page_with_status_401_is_a_refused_login(page):
+    """As of Axis and Hikvision."""
+    with (
+        answering(lambda asked: (401, page)) as client,
+        pytest.raises(LoginFaultError, match="check user and password"),
+    ):
+        client.call("/", "x", "GetProfiles")
