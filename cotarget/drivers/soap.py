@@ -37,7 +37,9 @@ CONNECT_S = 2.0  # on a local network a running device accepts a connection with
 LONGEST_ANSWER = 1 << 20  # [bytes]; the longest list of profiles has a tenth
 LONGEST_QUOTE = 100  # of a device's text in a message [characters]
 CLOCK_S = 5.0  # a clock that is off by more is named in messages [s]
+CLOCK_STEP_S = 1.0  # two answers of a steady clock, in whole seconds, differ by less [s]
 NOT_AUTHORIZED = "NotAuthorized"
+LOGIN_CODES = {NOT_AUTHORIZED, "FailedAuthentication"}  # of ONVIF, and of WS-Security as gSOAP has it
 # A command that was given up is discarded with its connection; else the system repeats it, and it may follow the stop.
 DISCARD = (socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
@@ -127,7 +129,7 @@ def fault_of(root: Element, name: str, what: str) -> FaultError | None:
     ]
     codes = tuple(value.strip().rpartition(":")[2] for value in values)
     said = text_at(fault, "Reason/Text") or next((each.text or "" for each in fault.iter("faultstring")), "")
-    kind = LoginFaultError if NOT_AUTHORIZED in codes else FaultError
+    kind = LoginFaultError if LOGIN_CODES.intersection(codes) else FaultError
     return kind(name, what, codes, quote(said))
 
 
@@ -209,9 +211,11 @@ class SoapClient:
             return self._exchange(path, namespace, message, inner, deadline)
         except LoginFaultError as error:
             if self._user:
-                self._offset_s = self._ask_clock(deadline)  # it may have been set since
-                with contextlib.suppress(LoginFaultError):
-                    return self._exchange(path, namespace, message, inner, deadline)
+                before, self._offset_s = self.clock_off_s, self._ask_clock(deadline)  # it may have been set since
+                # Devices lock a user who is refused often.
+                if abs(self._offset_s - before) > CLOCK_STEP_S:
+                    with contextlib.suppress(LoginFaultError):
+                        return self._exchange(path, namespace, message, inner, deadline)
             raise LoginFaultError(self.name, message, error.codes, self._why_refused()) from None
 
     def _why_refused(self) -> str:

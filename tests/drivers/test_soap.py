@@ -7,7 +7,7 @@ import http.server
 import socket
 import threading
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from xml.etree.ElementTree import fromstring
 
 import pytest
@@ -31,12 +31,28 @@ from tests.support.loopback import Loopback
 TT = "http://www.onvif.org/ver10/schema"
 
 
+CLOCK = "<q:Time><q:Hour>%H</q:Hour><q:Minute>%M</q:Minute><q:Second>%S</q:Second></q:Time>"
+DATE = "<q:Date><q:Year>%Y</q:Year><q:Month>%m</q:Month><q:Day>%d</q:Day></q:Date>"
+TIME = (
+    "<r:GetSystemDateAndTimeResponse xmlns:r='x'><r:SystemDateAndTime><q:UTCDateTime>{}{}</q:UTCDateTime>"
+    "</r:SystemDateAndTime></r:GetSystemDateAndTimeResponse>"
+)
+REFUSED = (
+    "<env:Fault><env:Code><env:Value>env:Sender</env:Value><env:Subcode><env:Value>wsse:FailedAuthentication"
+    "</env:Value></env:Subcode></env:Code><env:Reason><env:Text>no</env:Text></env:Reason></env:Fault>"
+)
+
+
+def wrapped(body):
+    return (
+        f'<?xml version="1.0"?><env:Envelope xmlns:env="http://www.w3.org/2003/05/soap-envelope" xmlns:q="{TT}" '
+        f'xmlns:er="http://www.onvif.org/ver10/error"><env:Body>{body}</env:Body></env:Envelope>'
+    )
+
+
 def said(body):
     """An answer, whose prefixes are none that a client may rely on."""
-    return parse_xml(
-        f'<?xml version="1.0"?><env:Envelope xmlns:env="http://www.w3.org/2003/05/soap-envelope" xmlns:q="{TT}" '
-        f'xmlns:er="http://www.onvif.org/ver10/error"><env:Body>{body}</env:Body></env:Envelope>'.encode()
-    )
+    return parse_xml(wrapped(body).encode())
 
 
 @pytest.mark.parametrize("data", [
@@ -83,16 +99,12 @@ def test_durations(text, value):
 
 
 def test_the_devices_time_is_its_utc_time():
-    clock = "<q:Time><q:Hour>23</q:Hour><q:Minute>5</q:Minute><q:Second>{}</q:Second></q:Time>"
-    date = "<q:Date><q:Year>2026</q:Year><q:Month>2</q:Month><q:Day>{}</q:Day></q:Date>"
-    wrapped = (
-        "<r:GetSystemDateAndTimeResponse xmlns:r='x'><r:SystemDateAndTime><q:UTCDateTime>{}{}</q:UTCDateTime>"
-        "</r:SystemDateAndTime></r:GetSystemDateAndTimeResponse>"
-    )
-    found = device_time(said(wrapped.format(clock.format(7), date.format(28))))
+    clock = CLOCK.replace("%H", "23").replace("%M", "5").replace("%S", "{}")
+    date = DATE.replace("%Y", "2026").replace("%m", "2").replace("%d", "{}")
+    found = device_time(said(TIME.format(clock.format(7), date.format(28))))
     assert found == datetime(2026, 2, 28, 23, 5, 7, tzinfo=UTC)
-    assert device_time(said(wrapped.format(clock.format(60), date.format(28)))) is not None  # a leap second
-    assert device_time(said(wrapped.format(clock.format(7), date.format(30)))) is None
+    assert device_time(said(TIME.format(clock.format(60), date.format(28)))) is not None  # a leap second
+    assert device_time(said(TIME.format(clock.format(7), date.format(30)))) is None
     assert device_time(said("<other/>")) is None
 
 
@@ -246,3 +258,20 @@ def test_a_page_with_status_401_is_a_refused_login(page):
         pytest.raises(LoginFaultError, match="check user and password"),
     ):
         client.call("/", "x", "GetProfiles")
+
+
+@pytest.mark.parametrize(("steps", "logins"), [((0, 0), 1), ((0, 3600), 2)])
+def test_a_refused_login_is_repeated_only_where_the_clock_was_set_since(steps, logins):
+    """A device of gSOAP, which locks a user who is refused often."""
+    clock, asked = list(steps), []
+
+    def answer(envelope):
+        if "GetSystemDateAndTime" in envelope:
+            now = datetime.now(UTC) + timedelta(seconds=clock.pop(0))
+            return 200, wrapped(TIME.format(f"{now:{CLOCK}}", f"{now:{DATE}}"))
+        asked.append(envelope)
+        return 400, wrapped(REFUSED)
+
+    with answering(answer, "root", "wrong") as client, pytest.raises(LoginFaultError, match="not for the user 'root'"):
+        client.call("/", "x", "GetProfiles")
+    assert len(asked) == logins
