@@ -27,7 +27,7 @@ from xml.etree.ElementTree import Element
 
 from cotarget.drivers.axes import AxisFacts, Poll
 from cotarget.drivers.head_link import Pair, Requests
-from cotarget.drivers.link_errors import RefusedError
+from cotarget.drivers.link_errors import CutError, RefusedError
 from cotarget.drivers.ptz import Dome, PtzLink, PtzSettings
 from cotarget.drivers.soap import (
     DEVICE,
@@ -479,7 +479,11 @@ class OnvifLink(PtzLink):
             self._heard, self._seen = now, status
             polls = self._polls(status, now)
             if self._is_steered:
-                self._steer(requests)
+                try:
+                    self._steer(requests)
+                except RefusedError as error:  # such as "busy": it ends the move
+                    self._stop(now + STOP_S)
+                    raise CutError(str(error)) from None
             return polls
         if now - self._heard < BLIND_S:
             return []

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import math
 import re
 import subprocess
@@ -15,8 +16,8 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers import onvif
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.onvif import OnvifDome, OnvifLink
-from cotarget.emulators.onvif import ANSWERS, TPTZ
-from cotarget.errors import ConfigError, CotargetError
+from cotarget.emulators.onvif import ANSWERS, TPTZ, SoapFault
+from cotarget.errors import ConfigError, CotargetError, DeviceError
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
 from tests.support.plants import PASSWORD, fails, wait_for
 
@@ -338,6 +339,33 @@ def test_a_steered_head_follows_a_goal_that_moves():
             time.sleep(0.1)
             lags.append(8.0 * (time.monotonic() - begin) - unit.pan.degrees())
         assert abs(sorted(lags[20:])[len(lags[20:]) // 2]) < 1.5
+
+
+def counted(monkeypatch, name, answer):
+    """Let a function answer a message of the PTZ service; it is called with the number of messages so far, too."""
+    usual, number = ANSWERS[TPTZ, name], itertools.count()
+    monkeypatch.setitem(ANSWERS, (TPTZ, name), lambda *about: answer(next(number), usual, *about))
+
+
+@pytest.mark.parametrize("refused", [{3, 4}, set(range(3, 1000))], ids=["once", "from then on"])
+def test_a_refused_velocity_ends_the_move_and_not_the_head(monkeypatch, refused):
+    """With a timeout and without it; a move whose end is waited for is sent again."""
+
+    def answer(number, usual, camera, faults, message):
+        if number in refused and message.vector("Velocity")[:2] != (0.0, 0.0):
+            raise SoapFault("Busy", code="Receiver")
+        return usual(camera, faults, message)
+
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        counted(monkeypatch, "ContinuousMove", answer)
+        if len(refused) == 2:
+            dome.head.move(math.radians(30.0), 0.0, speed=math.radians(20.0), wait=True)
+            assert unit.pan.degrees() == pytest.approx(30.0, abs=unit.settings.slack_deg + NEAR_DEG)
+        else:
+            with pytest.raises(DeviceError, match="Busy"):
+                dome.head.move(math.radians(30.0), 0.0, speed=math.radians(20.0), wait=True)
+            wait_for(lambda: not unit.turning())
+        wait_for(lambda: not dome.head.state().moving)
 
 
 # What is wrong from the start
