@@ -671,8 +671,8 @@ class OnvifLink(PtzLink):
         except RefusedError:
             if not timeout:
                 raise
-            self._timeout_s = None  # some refuse a timeout though they say its range
             self._send("ContinuousMove", velocity, requests)
+            self._timeout_s = None  # some refuse a timeout though they say its range
         self._renewed = now
         for axis, speed in zip(self._steered, wanted, strict=True):
             axis.send(speed, now)

@@ -349,9 +349,11 @@ def counted(monkeypatch, name, answer):
 
 @pytest.mark.parametrize("refused", [{3, 4}, set(range(3, 1000))], ids=["once", "from then on"])
 def test_a_refused_velocity_ends_the_move_and_not_the_head(monkeypatch, refused):
-    """With a timeout and without it; a move whose end is waited for is sent again."""
+    """With a timeout and without it; a move whose end is waited for is sent again, with its timeout."""
+    timeouts = []
 
     def answer(number, usual, camera, faults, message):
+        timeouts.append(message.text("Timeout"))
         if number in refused and message.vector("Velocity")[:2] != (0.0, 0.0):
             raise SoapFault("Busy", code="Receiver")
         return usual(camera, faults, message)
@@ -361,6 +363,7 @@ def test_a_refused_velocity_ends_the_move_and_not_the_head(monkeypatch, refused)
         if len(refused) == 2:
             dome.head.move(math.radians(30.0), 0.0, speed=math.radians(20.0), wait=True)
             assert unit.pan.degrees() == pytest.approx(30.0, abs=unit.settings.slack_deg + NEAR_DEG)
+            assert "PT1S" in timeouts[6:]
         else:
             with pytest.raises(DeviceError, match="Busy"):
                 dome.head.move(math.radians(30.0), 0.0, speed=math.radians(20.0), wait=True)
