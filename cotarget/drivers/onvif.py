@@ -477,19 +477,16 @@ class OnvifLink(PtzLink):
         status, now = self._reader.take(), self._clock.now()
         if status is not None:
             self._heard, self._seen = now, status
-            polls = self._polls(status, now)
-            if self._is_steered:
-                try:
-                    self._steer(requests)
-                except RefusedError as error:  # such as "busy": it ends the move
-                    self._stop(now + STOP_S)
-                    raise CutError(str(error)) from None
-            return polls
-        if now - self._heard < BLIND_S:
+        elif now - self._heard < BLIND_S:
             return []
-        if self._is_steered and any(axis.velocity for axis in self._steered):
-            self._stop(now + STOP_S)
-        return self._polls(Status(None, None, None, now), now)
+        polls = self._polls(status or Status(None, None, None, now), now)
+        if self._is_steered:
+            try:
+                self._steer(requests, is_blind=status is None)
+            except RefusedError as error:  # such as "busy": it ends the move
+                self._stop(now + STOP_S)
+                raise CutError(str(error)) from None
+        return polls
 
     def move(self, goals: Pair, speeds: Pair, requests: Requests) -> None:
         """Send pan and tilt to positions by an absolute move, or begin to steer them there."""
@@ -648,13 +645,18 @@ class OnvifLink(PtzLink):
         goal = self._goals[axis] if self._goals[axis] is not None else place
         return self._reckoned[axis].at(now)[0] if goal is None else goal
 
-    def _steer(self, requests: Requests) -> None:
-        """Send the velocities that lead to the goals, where they change, or before the device ends them by itself."""
+    def _steer(self, requests: Requests, is_blind: bool = False) -> None:
+        """Send the velocities that lead to the goals, where they change, or before the device ends them by itself.
+
+        Where the device does not say any more where it is, they are 0 until it does.
+        """
         now = self._clock.now()
         pan, tilt, _ = self._positions(self._seen)
         assert pan is not None
         assert tilt is not None
         wanted = [axis.wanted(at, self._seen.t, now) for axis, at in zip(self._steered, (pan, tilt), strict=True)]
+        if is_blind:
+            wanted = [0.0, 0.0]
         fastest = self._settings.speed_deg_s
         same = all(
             abs(speed - axis.velocity) <= FINE * fastest and (speed == 0) == (axis.velocity == 0)

@@ -26,6 +26,7 @@ SAFETY = SafetyConfig(stop_file=None)
 NEAR_DEG = 2 * STEP_DEG
 LOST_S = 0.7  # longer than a stop waits for its answer
 AWAY_S = 0.25
+HANGS_AT, HANGS_S = 10, 2.0  # the status of this number takes so long
 SETTLED_S = 0.5  # of a halt's answer and of braking from the highest speed
 
 
@@ -369,6 +370,22 @@ def test_a_refused_velocity_ends_the_move_and_not_the_head(monkeypatch, refused)
                 dome.head.move(math.radians(30.0), 0.0, speed=math.radians(20.0), wait=True)
             wait_for(lambda: not unit.turning())
         wait_for(lambda: not dome.head.state().moving)
+
+
+def test_a_steered_head_stands_while_it_does_not_say_where_it_is_and_then_goes_on(monkeypatch):
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        stood = []
+
+        def answer(number, usual, *about):
+            if number == HANGS_AT:
+                time.sleep(HANGS_S)
+                stood.append(not unit.turning())
+            return usual(*about)
+
+        counted(monkeypatch, "GetStatus", answer)
+        dome.head.move(math.radians(40.0), 0.0, speed=math.radians(20.0), wait=True)
+        assert stood == [True]
+        assert unit.pan.degrees() == pytest.approx(40.0, abs=unit.settings.slack_deg + NEAR_DEG)
 
 
 # What is wrong from the start
