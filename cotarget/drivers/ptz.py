@@ -41,6 +41,7 @@ from cotarget.rig import Clock, Frame, UnitSpec, ZoomSpec, ZoomState
 from cotarget.schema import Check, Limits, Needed, NotNegative, Positive, Size, model
 
 Knots = tuple[tuple[float, float], ...]  # (zoom number, magnification)
+USUAL_KNOTS: Knots = ((0.0, 1.0), (1.0, 20.0))  # at the ends of a device's own range
 
 
 def _knots(lens: Knots) -> Knots:
@@ -98,7 +99,7 @@ class PtzSettings(PolledHeadSettings):
     @property
     def knots(self) -> Knots:
         """Zoom numbers and magnifications; a protocol with a table of its own gives that where `lens` is empty."""
-        return self.lens or ((0.0, 1.0), (1.0, 20.0))
+        return self.lens or USUAL_KNOTS
 
     @property
     def wide_px(self) -> float:
@@ -214,11 +215,11 @@ class Dome:
 
         self.head = PolledHead(open_link, config, clock, safety)
         try:
+            lens = self.head.lens(lens_positions(config, links[0].axes[2]))
             self._stream = StreamCamera(_with_address(config.stream(links[0].url)), clock)
         except BaseException:
             self.head.close()
             raise
-        lens = self.head.lens(lens_positions(config, links[0].axes[2]))
         self.zoom = DomeCamera(self._stream, lens, clock)
 
     def close(self) -> None:
@@ -228,11 +229,23 @@ class Dome:
 
 
 def lens_positions(config: PtzSettings, axis: AxisFacts) -> LensPositions:
-    """Make the focal lengths of a lens's numbers, those within the axis and the table."""
-    knots = tuple((number, magnification * config.wide_px) for number, magnification in config.knots)
-    lowest, highest = max(axis.lowest, knots[0][0]), min(axis.highest, knots[-1][0])
-    numbers = np.linspace(lowest, highest, round((highest - lowest) / axis.step) + 1)
-    return LensPositions(knots, numbers.tolist())
+    """Make the focal lengths of a lens's numbers, those within the axis and the table.
+
+    Raises:
+        ConfigError: fewer than two positions are within both.
+    """
+    table = config.knots
+    if table == USUAL_KNOTS and not config.lens:
+        table = tuple((end, times) for end, (_, times) in zip((axis.lowest, axis.highest), USUAL_KNOTS, strict=True))
+    lowest, highest = max(axis.lowest, table[0][0]), min(axis.highest, table[-1][0])
+    count = round((highest - lowest) / axis.step) + 1
+    if count < 2:
+        raise ConfigError(
+            f"hardware.ptz.lens: goes from {table[0][0]:g} to {table[-1][0]:g}, but the zoom of the device at "
+            f"{config.address} from {axis.lowest:g} to {axis.highest:g}; write numbers of that range"
+        )
+    knots = tuple((number, magnification * config.wide_px) for number, magnification in table)
+    return LensPositions(knots, np.linspace(lowest, highest, count).tolist())
 
 
 def _with_address(stream: StreamSettings) -> StreamSettings:

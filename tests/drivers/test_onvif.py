@@ -16,7 +16,7 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers import onvif
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.onvif import OnvifDome, OnvifLink
-from cotarget.emulators.onvif import ANSWERS, TPTZ, SoapFault
+from cotarget.emulators.onvif import ANSWERS, TPTZ, OnvifCamera, SoapFault
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
 from tests.support.plants import PASSWORD, fails, wait_for
@@ -388,7 +388,44 @@ def test_a_steered_head_stands_while_it_does_not_say_where_it_is_and_then_goes_o
         assert unit.pan.degrees() == pytest.approx(40.0, abs=unit.settings.slack_deg + NEAR_DEG)
 
 
+def zoom_from(monkeypatch, lowest, highest):
+    """Let the device's zoom have another range than from 0 to 1; its lens goes with the share of it."""
+    monkeypatch.setattr(OnvifCamera, "zoom_numbers", lambda camera: (lowest, highest))
+    go, position = OnvifCamera.go, OnvifCamera.position
+
+    def scaled_go(camera, goals, zoom, speeds):
+        go(camera, goals, None if zoom is None else (zoom - lowest) / (highest - lowest), speeds)
+
+    def scaled_position(camera):
+        pan, tilt, share = position(camera)
+        return pan, tilt, lowest + share * (highest - lowest)
+
+    monkeypatch.setattr(OnvifCamera, "go", scaled_go)
+    monkeypatch.setattr(OnvifCamera, "position", scaled_position)
+
+
+@pytest.mark.parametrize("ends", [(1.0, 41.0), (0.0, 100.0), (10.0, 100.0)])
+def test_a_lens_without_a_table_has_the_devices_own_range(ends, monkeypatch):
+    zoom_from(monkeypatch, *ends)
+    with OnvifUnit() as unit, opened(unit, lens=()) as dome:
+        shortest, longest = dome.zoom.focal_range
+        assert longest == pytest.approx(20 * shortest)
+        dome.zoom.zoom(longest)
+        wait_for(lambda: not dome.zoom.state().moving)
+        assert unit.lens.position() == unit.lens.last
+
+
 # What is wrong from the start
+
+
+@pytest.mark.parametrize("ends", [(1.0, 41.0), (10.0, 100.0)])
+def test_a_table_outside_of_the_devices_range_is_refused_and_nothing_stays_open(ends, monkeypatch):
+    zoom_from(monkeypatch, *ends)
+    before = set(threading.enumerate())
+    with OnvifUnit() as unit:
+        said = refused(unit)
+        assert re.search(f"hardware.ptz.lens: .* from {ends[0]:g} to {ends[1]:g}; write numbers of that range", said)
+    wait_for(lambda: set(threading.enumerate()) <= before)
 
 
 @pytest.mark.parametrize(("profile", "said"), [
