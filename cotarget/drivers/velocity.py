@@ -78,7 +78,7 @@ class SteeredAxis:
     def aim(self, goal: float, speed: float, now: float) -> None:
         """Set a goal and the highest speed."""
         passed = now - self._aimed
-        if self._goal is None or passed >= FLOW_S:
+        if self._goal is None or passed >= FLOW_S or goal == self._goal:  # a goal at rest, as at the end of the range
             self._flow = 0.0
         elif passed > 0:
             self._flow += FLOW_GAIN * ((goal - self._goal) / passed - self._flow)
@@ -100,7 +100,10 @@ class SteeredAxis:
         if self._goal is None:
             return 0.0
         flow = self._flow if now - self._aimed < FLOW_S else 0.0
-        error = self._goal + flow * (now - self._aimed) - self._predicted(position, t, now)
+        goal = self._goal + flow * (now - self._aimed)
+        if not self._facts.lowest < goal < self._facts.highest:
+            goal, flow = min(max(goal, self._facts.lowest), self._facts.highest), 0.0
+        error = goal - self._predicted(position, t, now)
         if abs(error) <= max(self._facts.slack / 2, self._facts.same) and abs(flow) < GAIN_HZ * self._facts.slack:
             return 0.0
         return min(max(flow + GAIN_HZ * error, -self._limit), self._limit)

@@ -69,6 +69,34 @@ def test_an_axis_keeps_up_with_a_goal_that_moves():
     assert places[-1] == pytest.approx(8.0 * (4.0 - DELAY_S), abs=0.3)
 
 
+def test_an_axis_does_not_go_beyond_its_range_with_its_goals():
+    """They come at 40/s and stay at its end."""
+    places = steered(lambda now: min(40.0 * now, FACTS.highest), 5.0)
+    assert max(places) <= FACTS.highest
+    assert places[-1] == pytest.approx(FACTS.highest, abs=FACTS.slack)
+
+
+def test_a_goal_that_is_given_again_moves_no_more():
+    """As at a soft limit."""
+    axis = SteeredAxis(FACTS, 0.0)
+    for i in range(10):
+        axis.aim(4.0 * i, 50.0, i * 0.1)
+        axis.send(0.0, i * 0.1)
+    assert axis.wanted(36.0, 0.9, 0.9) > 20.0
+    axis.aim(36.0, 50.0, 1.0)
+    assert axis.wanted(36.0, 1.0, 1.0) == 0.0
+
+
+def test_goals_that_end_at_the_range_lead_not_beyond_it():
+    """The last goal, 2 before the end, has 0.4 s of flow at 40/s."""
+    axis = SteeredAxis(FACTS, 0.0)
+    for i in range(20):
+        axis.aim(98.0 - 40.0 * (19 - i) * 0.1, 50.0, i * 0.1)
+        axis.send(0.0, i * 0.1)
+    assert axis.wanted(98.0, 2.3, 2.3) == pytest.approx(4.0 * 2.0)
+    assert axis.wanted(100.0, 2.3, 2.3) == 0.0
+
+
 def test_no_velocity_is_above_the_limit():
     axis = SteeredAxis(FACTS, DELAY_S)
     axis.aim(90.0, 20.0, 0.0)
