@@ -228,6 +228,14 @@ def vector(pan: float | None, tilt: float | None, zoom: float | None, spaces: tu
     return turned + ("" if zoom is None else f'<t:Zoom x="{zoom:.6f}"{named[1]}/>')
 
 
+def speeds_in(space: Space | None, pan: float, tilt: float) -> str:
+    """Write shares of the highest speeds of pan and tilt as XML, in the numbers of a space; as they are without one."""
+    uri, ranges = space or Space("", ())
+    ends = ranges or (Range(-1.0, 1.0),)  # speeds without direction have one range for both
+    fastest = [max(-end.lowest, end.highest) for end in (ends[0], ends[-1])]
+    return vector(pan * fastest[0], tilt * fastest[1], None, (uri, ""))
+
+
 class OnvifDevice:
     """The device's services, as far as they move it and show it.
 
@@ -498,7 +506,8 @@ class OnvifLink(PtzLink):
             return
         zoom = self._goal_or_place(2, now) if self._settings.all_axes else None
         fastest = self._settings.speed_deg_s
-        self._absolute(goals, zoom, tuple(min(speed / fastest, 1.0) for speed in speeds), requests)
+        pan, tilt = (min(speed / fastest, 1.0) for speed in speeds)
+        self._absolute(goals, zoom, (pan, tilt), requests)
         for reckoned, goal, speed in zip(self._reckoned[:2], goals, speeds, strict=True):
             reckoned.command(goal, speed, now)
 
@@ -665,8 +674,7 @@ class OnvifLink(PtzLink):
         due = any(wanted) and now - self._renewed > (self._timeout_s or TIMEOUT_S) / 2
         if same and not due:
             return
-        # A zoom of 0 would stop the lens.
-        velocity = f"<Velocity>{vector(wanted[0] / fastest, wanted[1] / fastest, None)}</Velocity>"
+        velocity = self._velocity(wanted[0] / fastest, wanted[1] / fastest)
         timeout = f"<Timeout>PT{self._timeout_s:g}S</Timeout>" if self._timeout_s else ""
         try:
             self._send("ContinuousMove", velocity + timeout, requests)
@@ -679,11 +687,16 @@ class OnvifLink(PtzLink):
         for axis, speed in zip(self._steered, wanted, strict=True):
             axis.send(speed, now)
 
+    def _velocity(self, pan: float, tilt: float) -> str:
+        """Write velocities as shares of the highest; without a zoom, since one of 0 would stop the lens."""
+        space = self._device.abilities.space("ContinuousPanTiltVelocitySpace")
+        return f"<Velocity>{speeds_in(space, pan, tilt)}</Velocity>"
+
     def _stop(self, deadline: float) -> None:
         """Stop by a stop and by velocities of zero, since devices may ignore one; repeat each until it is answered."""
         orders = [("Stop", "<PanTilt>true</PanTilt><Zoom>false</Zoom>")]
         if self._device.abilities.space("ContinuousPanTiltVelocitySpace"):
-            orders.append(("ContinuousMove", f"<Velocity>{vector(0.0, 0.0, None)}</Velocity>"))
+            orders.append(("ContinuousMove", self._velocity(0.0, 0.0)))
         faults, count = list[BaseException](), len(orders)
         while orders:
             answers = [self._workers.submit(partial(self._device.command, *order, STOP_S)) for order in orders]
@@ -705,13 +718,11 @@ class OnvifLink(PtzLink):
         for reckoned in self._reckoned[:2]:
             reckoned.halt(now)
 
-    def _absolute(
-        self, goals: Pair | None, zoom: float | None, speeds: tuple[float, ...] | None, requests: Requests
-    ) -> None:
+    def _absolute(self, goals: Pair | None, zoom: float | None, speeds: Pair | None, requests: Requests) -> None:
         pan, tilt = (None, None) if goals is None else map(Coordinate.to_number, self._coordinates[:2], goals)
         inner = f"<Position>{vector(pan, tilt, zoom, self._uris)}</Position>"
         if speeds is not None and goals is not None:
-            inner += f"<Speed>{vector(speeds[0], speeds[1], None)}</Speed>"
+            inner += f"<Speed>{speeds_in(self._device.abilities.space('PanTiltSpeedSpace'), *speeds)}</Speed>"
         self._send("AbsoluteMove", inner, requests)
 
     def _send(self, message: str, inner: str, requests: Requests) -> None:

@@ -16,7 +16,7 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers import onvif
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.onvif import OnvifDome, OnvifLink
-from cotarget.emulators.onvif import ANSWERS, TPTZ, OnvifCamera, SoapFault
+from cotarget.emulators.onvif import ANSWERS, PAN_TILT, TPTZ, OnvifCamera, SoapFault
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
 from tests.support.plants import PASSWORD, fails, wait_for
@@ -413,6 +413,31 @@ def test_a_lens_without_a_table_has_the_devices_own_range(ends, monkeypatch):
         dome.zoom.zoom(longest)
         wait_for(lambda: not dome.zoom.state().moving)
         assert unit.lens.position() == unit.lens.last
+
+
+@pytest.mark.parametrize(("profiles", "name", "part", "message"), [
+    (("continuous-only",), "ContinuousPanTiltVelocitySpace", "Velocity", "ContinuousMove"),
+    ((), "PanTiltSpeedSpace", "Speed", "AbsoluteMove"),
+])  # fmt: skip
+def test_speeds_have_the_numbers_and_the_name_of_their_space(profiles, name, part, message, monkeypatch):
+    """To 64 at the highest: at a fifth of it, 12.8."""
+    asked = []
+
+    def options(number, usual, *about):
+        block = re.compile(f"(<tt:{name}>.*?Max>)1(<.*?</tt:{name}>)")
+        return block.sub(r"\g<1>64\2", usual(*about))
+
+    def answer(number, usual, camera, faults, said):
+        asked.append(said.body.find(f"{{*}}{part}/{{*}}PanTilt"))
+        return usual(camera, faults, said)
+
+    counted(monkeypatch, "GetConfigurationOptions", options)
+    with OnvifUnit(*profiles) as unit, opened(unit) as dome:
+        counted(monkeypatch, message, answer)
+        dome.head.move(math.radians(100.0), 0.0, speed=math.radians(20.0))
+        wait_for(lambda: asked)
+        assert float(asked[0].get("x")) == pytest.approx(0.2 * 64.0)
+        assert asked[0].get("space").startswith(PAN_TILT)
 
 
 # What is wrong from the start
