@@ -42,6 +42,7 @@ from cotarget.drivers.soap import (
 )
 from cotarget.drivers.velocity import ReckonedAxis, SteeredAxis
 from cotarget.errors import ConfigError, DeviceError
+from cotarget.plugins import place_of
 from cotarget.rig import Clock
 from cotarget.schema import NotNegative, Positive, model
 
@@ -388,7 +389,7 @@ class StatusReader:
         """Return the newest positions; None where there are none since the last call.
 
         Raises:
-            DeviceError: the device has gone.
+            DeviceError: the device has gone, or the thread has ended by a mistake in the driver.
         """
         if self._error is not None:
             raise self._error
@@ -412,6 +413,9 @@ class StatusReader:
                 if failed == STATUS_TRIES:
                     self._error = error
                     return
+            except Exception as error:  # without its thread the head would look healthy
+                self._error = DeviceError(f"the driver of the dome failed: {error!r} ({place_of(error)})")
+                return
 
 
 class Workers:

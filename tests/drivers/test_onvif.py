@@ -15,7 +15,7 @@ import pytest
 from cotarget.config import SafetyConfig
 from cotarget.drivers import onvif
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.onvif import OnvifDome, OnvifLink
+from cotarget.drivers.onvif import OnvifDevice, OnvifDome, OnvifLink
 from cotarget.emulators.onvif import ANSWERS, PAN_TILT, TPTZ, OnvifCamera, SoapFault
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
@@ -273,6 +273,20 @@ def test_a_fault_in_mid_move_is_an_error_of_one_line(fault, monkeypatch):
         said = fails(dome.head.state)
         assert len(said.splitlines()) == 1
         unit.faults.set(fault, False)
+
+
+def test_a_mistake_where_positions_are_read_is_an_error_of_the_head(monkeypatch):
+    begun, status = threading.Event(), OnvifDevice.status
+
+    def read(device):
+        if begun.is_set():
+            raise ValueError("a mistake")
+        return status(device)
+
+    monkeypatch.setattr(OnvifDevice, "status", read)
+    with OnvifUnit() as unit, opened(unit) as dome:
+        begun.set()
+        assert "a mistake" in fails(dome.head.state)
 
 
 # Devices that do not say where they are, or do not go where they are sent
