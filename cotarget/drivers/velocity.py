@@ -31,10 +31,16 @@ class ReckonedAxis:
         ends = (facts.lowest, facts.highest)
         self._motions = [LensMotion(end, end, 0.0, facts.fastest) for end in ends]
 
+    @property
+    def arrives(self) -> float:
+        """Time at which the axis should be at its goal [s]."""
+        return max(motion.arrives for motion in self._motions)
+
     def correct(self, position: float, t: float) -> None:
         """Take a position that the device has said; a motion under way goes on from there."""
         newest = self._motions[0]
-        goal = position if t >= max(motion.arrives for motion in self._motions) else newest.goal
+        stands = t >= self.arrives or newest.start == newest.goal
+        goal = position if stands else newest.goal
         self._motions = [LensMotion(position, goal, max(t, newest.t), newest.speed)] * 2
 
     def command(self, goal: float, speed: float, now: float) -> None:

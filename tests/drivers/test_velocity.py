@@ -36,6 +36,16 @@ def test_a_known_axis_is_where_its_speed_takes_it():
     assert axis.at(9.5) == (11.0, 0.0)
 
 
+def test_an_axis_that_was_halted_stays_where_it_says_it_is():
+    """Halted at 0 by reckoning; it says 3, of a time before the halt, and nothing more."""
+    axis = ReckonedAxis(FACTS, 0.0)
+    axis.correct(0.0, 0.0)
+    axis.halt(1.0)
+    axis.correct(3.0, 0.9)
+    assert axis.at(9.0) == (3.0, 0.0)
+    assert axis.arrives <= 1.0
+
+
 def steered(goals, seconds, late=0.05, start=0.0):
     """Positions of an axis that turns at the velocities it gets, ``DELAY_S`` later, and is asked 20 times a second."""
     axis, position, sent, places = SteeredAxis(FACTS, DELAY_S), start, [], []
