@@ -25,9 +25,10 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 from xml.etree.ElementTree import Element
 
-from cotarget.drivers.axes import AxisFacts, Poll
+from cotarget.drivers.axes import AXES, AxisFacts, Poll
 from cotarget.drivers.head_link import Pair, Requests
-from cotarget.drivers.link_errors import CutError, RefusedError
+from cotarget.drivers.link_errors import CutError, RefusedError, SilentError
+from cotarget.drivers.polled_head import UNHEARD_S
 from cotarget.drivers.ptz import Dome, PtzLink, PtzSettings
 from cotarget.drivers.soap import (
     DEVICE,
@@ -476,6 +477,9 @@ class OnvifLink(PtzLink):
             self._steered = [SteeredAxis(facts, settings.command_delay_s) for facts in self.axes[:2]]
             self._renewed, self._timeout_s = -math.inf, self._find_timeout()
             self._seen, self._heard = status, clock.now()
+            self._said = dict[int, float]()  # when the device said the position of each axis last
+            self._due = -math.inf  # when the newest move or zoom should have ended
+            self._blocks = False  # whether a status has been late before
             self.identity = self._describe(status)
             self._goals: tuple[float | None, float | None, float | None] = self._positions(status)
             self._workers = Workers()
@@ -488,6 +492,7 @@ class OnvifLink(PtzLink):
         """Take the newest positions, and reckon those that the device does not say; steer an axis on its way."""
         status, now = self._reader.take(), self._clock.now()
         if status is not None:
+            self._blocks |= now - self._heard > BLIND_S
             self._heard, self._seen = now, status
         elif now - self._heard < BLIND_S:
             return []
@@ -514,6 +519,7 @@ class OnvifLink(PtzLink):
         self._absolute(goals, zoom, (pan, tilt), requests)
         for reckoned, goal, speed in zip(self._reckoned[:2], goals, speeds, strict=True):
             reckoned.command(goal, speed, now)
+        self._due = max(reckoned.arrives for reckoned in self._reckoned)
 
     def zoom(self, position: float, requests: Requests) -> None:
         """Send the lens to a position."""
@@ -522,6 +528,7 @@ class OnvifLink(PtzLink):
         both = (self._goal_or_place(0, now), self._goal_or_place(1, now)) if all_axes else None
         self._absolute(both, position, None, requests)
         self._reckoned[2].command(position, self.axes[2].fastest, now)
+        self._due = max(reckoned.arrives for reckoned in self._reckoned)
 
     def halt(self, patience: float) -> None:
         """Stop pan and tilt; once more when a command that was given up is answered, since it may move them later."""
@@ -643,12 +650,19 @@ class OnvifLink(PtzLink):
         polls = []
         for i, (position, reckoned) in enumerate(zip(self._positions(status), self._reckoned, strict=True)):
             if position is None:
+                self._refuse_silence(i, now)
                 here, sigma = reckoned.at(now)
                 polls.append(Poll(i, here, now, sigma=sigma))
             else:
+                self._said[i] = now
                 reckoned.correct(position, status.t)
                 polls.append(Poll(i, position, status.t))
         return polls
+
+    def _refuse_silence(self, axis: int, now: float) -> None:
+        """Raise where an axis says no position any more, though it should stand, and no status was late before."""
+        if now - max(self._said.get(axis, now), self._due) > UNHEARD_S and not self._blocks:
+            raise SilentError(f"{self.name} has said no position of {AXES[axis]} for {UNHEARD_S:g} s")
 
     # Commands
 
@@ -716,7 +730,7 @@ class OnvifLink(PtzLink):
         if len(faults) == count:
             why = f"; {RIGHTS}" if isinstance(faults[0], LoginFaultError) else ""
             raise DeviceError(f"{self.name} does not stop: {faults[0]}{why}") from faults[0]
-        now = self._clock.now()
+        self._due = now = self._clock.now()
         for steered in self._steered:
             steered.stop(now)
         for reckoned in self._reckoned[:2]:

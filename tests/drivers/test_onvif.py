@@ -26,6 +26,7 @@ SAFETY = SafetyConfig(stop_file=None)
 NEAR_DEG = 2 * STEP_DEG
 LOST_S = 0.7  # longer than a stop waits for its answer
 AWAY_S = 0.25
+SILENT_S = 60.0
 HANGS_AT, HANGS_S = 10, 2.0  # the status of this number takes so long
 SETTLED_S = 0.5  # of a halt's answer and of braking from the highest speed
 
@@ -48,6 +49,12 @@ def refused(unit, **changes):
     assert len(str(caught.value).splitlines()) == 1
     assert PASSWORD not in str(caught.value)
     return str(caught.value)
+
+
+def counted(monkeypatch, name, answer):
+    """Let a function answer a message of the PTZ service; it is called with the number of messages so far, too."""
+    usual, number = ANSWERS[TPTZ, name], itertools.count()
+    monkeypatch.setitem(ANSWERS, (TPTZ, name), lambda *about: answer(next(number), usual, *about))
 
 
 def test_the_head_goes_where_it_is_sent_and_the_lens_too():
@@ -289,6 +296,42 @@ def test_a_mistake_where_positions_are_read_is_an_error_of_the_head(monkeypatch)
         assert "a mistake" in fails(dome.head.state)
 
 
+@pytest.mark.parametrize("lost", ["all", "pan"])
+def test_a_standing_head_that_says_its_position_no_more_is_an_error(lost, monkeypatch):
+    monkeypatch.setattr(onvif, "UNHEARD_S", 1.0)
+    begun = threading.Event()
+    with OnvifUnit() as unit:
+
+        def answer(number, usual, *about):
+            if begun.is_set() and lost == "all":
+                unit.server.closing.wait(SILENT_S)
+            said = usual(*about)
+            return re.sub("<tt:PanTilt x.*?>", "", said) if begun.is_set() else said
+
+        counted(monkeypatch, "GetStatus", answer)
+        with opened(unit) as dome:
+            begun.set()
+            assert "has said no position of pan for 1 s" in fails(dome.head.state)
+
+
+def test_a_status_that_has_been_late_before_may_be_late_again(monkeypatch):
+    monkeypatch.setattr(onvif, "UNHEARD_S", 1.0)
+    late_s = [2.0, 0.9]
+
+    def answer(number, usual, *about):
+        if begun.is_set() and late_s:
+            time.sleep(late_s.pop())
+        return usual(*about)
+
+    begun = threading.Event()
+    counted(monkeypatch, "GetStatus", answer)
+    with OnvifUnit() as unit, opened(unit) as dome:
+        begun.set()
+        wait_for(lambda: not late_s)
+        time.sleep(2.5)
+        assert not dome.head.state().moving
+
+
 # Devices that do not say where they are, or do not go where they are sent
 
 
@@ -354,12 +397,6 @@ def test_a_steered_head_follows_a_goal_that_moves():
             time.sleep(0.1)
             lags.append(8.0 * (time.monotonic() - begin) - unit.pan.degrees())
         assert abs(sorted(lags[20:])[len(lags[20:]) // 2]) < 1.5
-
-
-def counted(monkeypatch, name, answer):
-    """Let a function answer a message of the PTZ service; it is called with the number of messages so far, too."""
-    usual, number = ANSWERS[TPTZ, name], itertools.count()
-    monkeypatch.setitem(ANSWERS, (TPTZ, name), lambda *about: answer(next(number), usual, *about))
 
 
 @pytest.mark.parametrize("refused", [{3, 4}, set(range(3, 1000))], ids=["once", "from then on"])
