@@ -278,7 +278,12 @@ class OnvifDevice:
     def status(self) -> Status:
         """Ask for the positions."""
         begin = self._clock.now()
-        root = self._ask(self._ptz, PTZ, "GetStatus", self._token, STATUS_S)
+        try:
+            root = self._ask(self._ptz, PTZ, "GetStatus", self._token, STATUS_S)
+        except LoginFaultError:
+            raise
+        except FaultError:  # some have no status
+            return Status(None, None, None, self._clock.now())
         now = self._clock.now()
         return status_of(root, now - min((now - begin) / 2, LATEST_S) - self._settings.status_delay_s)
 

@@ -353,6 +353,16 @@ def test_positions_that_are_not_said_are_reckoned(profile):
         assert dome.zoom.state().focal_px == pytest.approx(dome.zoom.focal_range[1], rel=0.02)
 
 
+def test_a_device_without_a_status_is_reckoned_too(monkeypatch):
+    def answer(number, usual, *about):
+        raise SoapFault("Optional action not implemented", "ActionNotSupported", code="Receiver")
+
+    counted(monkeypatch, "GetStatus", answer)
+    with OnvifUnit() as unit, opened(unit, zoom_s=1.0) as dome:
+        dome.head.move(math.radians(-20.0), math.radians(10.0), wait=True)
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((-20.0, 10.0), abs=NEAR_DEG)
+
+
 @pytest.mark.parametrize("profiles", [
     ("no-absolute",), ("continuous-only",), ("continuous-only", "timeout-fault"), ("continuous-only", "slow-stop"),
     ("continuous-only", "stop-ignored"), ("continuous-only", "timeout-clamped"), ("continuous-only", "wide-ranges"),
