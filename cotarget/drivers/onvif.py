@@ -41,6 +41,7 @@ from cotarget.drivers.soap import (
     quote,
     text_at,
 )
+from cotarget.drivers.stream import EXAMPLE, stream_address
 from cotarget.drivers.velocity import ReckonedAxis, SteeredAxis
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.plugins import place_of
@@ -272,7 +273,7 @@ class OnvifDevice:
             self.profile, self.configuration = self._find_profile(media)
             token = f"<ConfigurationToken>{self.configuration.get('token', '')}</ConfigurationToken>"
             self.abilities = abilities_of(self._ask(self._ptz, PTZ, "GetConfigurationOptions", token))
-            self.url = self._stream_address(media)
+            self.url = settings.url or self._stream_address(media)
             opened.pop_all()
 
     def status(self) -> Status:
@@ -369,11 +370,18 @@ class OnvifDevice:
             root = self._ask(media, MEDIA, "GetStreamUri", inner)
         except FaultError:
             return ""
-        parts = urlsplit(text_at(root, "Body/GetStreamUriResponse/MediaUri/Uri"))
+        said = text_at(root, "Body/GetStreamUriResponse/MediaUri/Uri")
         host = f"[{self._settings.host}]" if ":" in self._settings.host else self._settings.host
-        where = parts.netloc.rpartition("@")[2].rpartition(":")
-        port = f":{where[2]}" if where[1] and where[2].isdigit() else ""
-        return parts._replace(netloc=f"{host}{port}").geturl() if parts.netloc else ""
+        try:
+            parts = urlsplit(said)
+            where = parts.netloc.rpartition("@")[2].rpartition(":")
+            port = f":{where[2]}" if where[1] and where[2].isdigit() else ""
+            return stream_address(parts._replace(netloc=f"{host}{port}").geturl()) if parts.netloc else ""
+        except ValueError as error:
+            raise ConfigError(
+                f"hardware.ptz.url: the address that {self.name} names, {quote(said.rpartition('@')[2])}, {error}; "
+                f'write url = "{EXAMPLE}"'
+            ) from None
 
 
 # The link

@@ -16,7 +16,7 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers import onvif
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.onvif import OnvifDevice, OnvifDome, OnvifLink
-from cotarget.emulators.onvif import ANSWERS, PAN_TILT, TPTZ, OnvifCamera, SoapFault
+from cotarget.emulators.onvif import ANSWERS, PAN_TILT, TPTZ, TRT, OnvifCamera, SoapFault
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
 from tests.support.plants import PASSWORD, fails, wait_for
@@ -541,6 +541,21 @@ def test_a_dome_that_cannot_be_driven_is_named_in_one_line(profile, said, monkey
 def test_wrong_settings_are_named_in_one_line(changes, said):
     with OnvifUnit() as unit:
         assert re.search(said, refused(unit, **changes))
+
+
+@pytest.mark.parametrize("address", ["rtp://10.0.0.9/a", "rtsp://[fe80::/a", "rtsp://root:hunter2 & co@x:99999/a"])
+def test_an_address_of_the_stream_that_is_none_is_named_in_one_line(address, monkeypatch):
+    uri = address.replace("&", "&amp;")
+    usual = ANSWERS[TRT, "GetStreamUri"]
+    monkeypatch.setitem(
+        ANSWERS,
+        (TRT, "GetStreamUri"),
+        lambda *about: re.sub("<tt:Uri>.*</tt:Uri>", f"<tt:Uri>{uri}</tt:Uri>", usual(*about)),
+    )
+    with OnvifUnit() as unit:
+        assert "hardware.ptz.url: the address that the device at" in refused(unit)
+        with opened(unit, url=unit.stream.url) as dome:
+            assert dome.zoom.read(timeout=10.0).image.shape == (240, 320, 3)
 
 
 def test_another_protocol_at_the_port_is_named():
