@@ -18,7 +18,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from concurrent.futures import TimeoutError as NotDoneError
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from os import environ
 from typing import NamedTuple
@@ -148,12 +148,17 @@ class Status(NamedTuple):
 def abilities_of(root: Element) -> Abilities:
     """Read an answer to GetConfigurationOptions."""
     options = find(root, "Body/GetConfigurationOptionsResponse/PTZConfigurationOptions")
+    shortest, longest = (seconds(text_at(options, f"PTZTimeout/{name}")) for name in ("Min", "Max"))
+    return Abilities(spaces_of(find(options, "Spaces")), Range(shortest, longest))
+
+
+def spaces_of(element: Element | None) -> dict[str, tuple[Space, ...]]:
+    """Read the coordinate systems in an element, by the local names of theirs."""
     spaces: dict[str, tuple[Space, ...]] = {}
-    for each in find(options, "Spaces") or ():
+    for each in () if element is None else element:
         name = each.tag.rpartition("}")[2]
         spaces[name] = (*spaces.get(name, ()), space_of(each))
-    shortest, longest = (seconds(text_at(options, f"PTZTimeout/{name}")) for name in ("Min", "Max"))
-    return Abilities(spaces, Range(shortest, longest))
+    return spaces
 
 
 def space_of(element: Element) -> Space:
@@ -272,7 +277,8 @@ class OnvifDevice:
             media, self._ptz = self._services()
             self.profile, self.configuration = self._find_profile(media)
             token = f"<ConfigurationToken>{self.configuration.get('token', '')}</ConfigurationToken>"
-            self.abilities = abilities_of(self._ask(self._ptz, PTZ, "GetConfigurationOptions", token))
+            found = abilities_of(self._ask(self._ptz, PTZ, "GetConfigurationOptions", token))
+            self.abilities = replace(found, spaces=self._node_spaces() | dict(found.spaces))
             self.url = settings.url or self._stream_address(media)
             opened.pop_all()
 
@@ -361,6 +367,18 @@ class OnvifDevice:
                 f"hardware.ptz.profile: {self.name} has no '{wanted}' that moves; valid here: {', '.join(moving)}"
             )
         return wanted, moving[wanted]
+
+    def _node_spaces(self) -> dict[str, tuple[Space, ...]]:
+        """Return the coordinate systems of the configuration's node, which has those that some configurations lack."""
+        try:
+            nodes = find_all(self._ask(self._ptz, PTZ, "GetNodes"), "Body/GetNodesResponse/PTZNode")
+        except LoginFaultError:
+            raise
+        except FaultError:
+            return {}
+        wanted = text_at(self.configuration, "NodeToken")
+        node = next((node for node in nodes if node.get("token") == wanted), None)
+        return spaces_of(find(node, "SupportedPTZSpaces"))
 
     def _stream_address(self, media: str) -> str:
         """Return the address of the stream, at the host that the user has given; empty where the device says none."""

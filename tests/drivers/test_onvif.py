@@ -501,6 +501,18 @@ def test_speeds_have_the_numbers_and_the_name_of_their_space(profiles, name, par
         assert asked[0].get("space").startswith(PAN_TILT)
 
 
+def test_a_device_that_names_its_spaces_at_the_node_alone_is_sent_to_positions(monkeypatch):
+    counted(
+        monkeypatch,
+        "GetConfigurationOptions",
+        lambda number, usual, *about: re.sub("<tt:Spaces>.*</tt:Spaces>", "<tt:Spaces/>", usual(*about)),
+    )
+    with OnvifUnit() as unit, opened(unit) as dome:
+        dome.head.move(math.radians(20.0), math.radians(10.0), wait=True)
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((20.0, 10.0), abs=NEAR_DEG)
+        assert "AbsoluteMove" in unit.moves
+
+
 # What is wrong from the start
 
 
