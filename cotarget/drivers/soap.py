@@ -263,6 +263,8 @@ class SoapClient:
                     response = self._client.send(request, stream=True)
                     with contextlib.closing(response):
                         said = self._read(response, message, deadline)
+                    if self._client.is_closed:  # its pool does not know a connection that was made meanwhile
+                        response.extensions["network_stream"].close()
                     request = steps.send(response)
         self._date = _date(response.headers)
         try:

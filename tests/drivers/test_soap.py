@@ -181,10 +181,13 @@ class _Server(Loopback, http.server.ThreadingHTTPServer):
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"  # a connection is kept
+
     def do_POST(self):
         asked = self.rfile.read(int(self.headers["Content-Length"])).decode()
         status, page = self.server.answer(asked)
         self.send_response(status)
+        self.send_header("Content-Length", len(page.encode()))
         self.end_headers()
         self.wfile.write(page.encode())
 
@@ -275,3 +278,18 @@ def test_a_refused_login_is_repeated_only_where_the_clock_was_set_since(steps, l
     with answering(answer, "root", "wrong") as client, pytest.raises(LoginFaultError, match="not for the user 'root'"):
         client.call("/", "x", "GetProfiles")
     assert len(asked) == logins
+
+
+def test_a_connection_made_while_the_client_was_closed_is_closed_too(monkeypatch):
+    """httpx closes the connections that it knows, and this one comes later."""
+    connect, made = socket.create_connection, []
+
+    def late(*args, **kwargs):
+        made.append(connect(*args, **kwargs))
+        client.close()
+        return made[0]
+
+    with answering(lambda asked: (200, wrapped("<GetProfilesResponse/>"))) as client:
+        monkeypatch.setattr(socket, "create_connection", late)
+        client.call("/", "x", "GetProfiles")
+    assert made[0].fileno() == -1
