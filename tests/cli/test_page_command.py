@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from cotarget.cli.page_run import paced
 from cotarget.page.server import LOOPBACK, listen
 from cotarget.pipeline import HeadRun
 from tests.support.commands import call, refused
@@ -58,9 +59,17 @@ def at_link(links):
     return SimpleNamespace(port=int(port), page=SimpleNamespace(token=token))
 
 
-def steered(capsys, steer, *options):
-    """Status and stdout of a run that a thread steers."""
+def steered(capsys, monkeypatch, steer, *options):
+    """Status and stdout of a run that a thread steers, and that ends with it."""
     steering = threading.Thread(target=steer)
+
+    def while_steered(steps, *pace):
+        for step in paced(steps, *pace):
+            yield step
+            if not steering.is_alive():
+                return
+
+    monkeypatch.setattr("cotarget.cli.page_run.paced", while_steered)
     steering.start()
     code, out, _ = call(capsys, "follow", "--page", "--page-port", 0, *options)
     steering.join()
@@ -86,7 +95,7 @@ def test_the_demo_needs_no_file_and_is_steered_from_the_page(folder, capsys, mon
             done.append((folder / "rig.stop").read_text())
             status(mine)
 
-    code, out = steered(capsys, steer, "--record", "run", "--seconds", 4)
+    code, out = steered(capsys, monkeypatch, steer, "--record", "run")
     assert code == 0
     assert done == ["stopped from the page\n"]
     assert set(json.loads(out)["states"]) >= {"standing"}
@@ -115,7 +124,7 @@ def test_a_recording_that_begins_in_the_middle_replays(folder, capsys, monkeypat
                     say(mine, do="drawn", n=0)
                     assert picture(mine, DEADLINE_S)
 
-    code, _ = steered(capsys, steer, "--seconds", 4)
+    code, _ = steered(capsys, monkeypatch, steer)
     assert code == 0
     assert seen == ["recording", "", "recording-2"]
     for name in ("recording", "recording-2"):

@@ -239,7 +239,7 @@ def test_others_are_seen_to_take_control(browser, at):
 def test_without_a_connection_it_says_in_large_letters_that_it_cannot_stop(browser):
     with served() as made:
         browser.open(made.page.link)
-        until(lambda: browser.js("document.getElementById('control')?.textContent") == "You have control.")
+        until(lambda: browser.text("control") == "You have control.")
     until(lambda: "cannot stop" in browser.text("offline-text"))
     assert browser.js("parseFloat(getComputedStyle(document.getElementById('offline')).fontSize)") >= 28
     assert browser.js("getComputedStyle(document.getElementById('offline')).display") == "block"
@@ -247,9 +247,9 @@ def test_without_a_connection_it_says_in_large_letters_that_it_cannot_stop(brows
 
 def test_an_old_link_and_none_say_so(browser, at):
     browser.js("sessionStorage.setItem('token', 'old'); location.reload()")
-    until(lambda: browser.js("document.getElementById('offline-text')?.textContent") == "This link is old.")
+    until(lambda: browser.text("offline-text") == "This link is old.")
     browser.js("sessionStorage.removeItem('token'); location.reload()")
-    until(lambda: "no token" in (browser.js("document.getElementById('offline-text')?.textContent") or ""))
+    until(lambda: "no token" in browser.text("offline-text"))
 
 
 @pytest.mark.parametrize("width", [320, 390, 768, 1600])

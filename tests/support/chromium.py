@@ -82,7 +82,8 @@ class Browser:
         return answer["result"].get("value")
 
     def text(self, name):
-        return self.js(f"document.getElementById('{name}').textContent")
+        """The text of an element; empty where the page has none yet."""
+        return self.js(f"document.getElementById('{name}')?.textContent ?? ''")
 
     def center(self, name, at=(0.5, 0.5)):
         """The place of an element's point, by parts of its size."""
