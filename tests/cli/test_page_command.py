@@ -92,6 +92,7 @@ def test_the_demo_needs_no_file_and_is_steered_from_the_page(folder, capsys, mon
             assert set(jpegs) == {"fixed", "zoom"}
             say(mine, do="stop")
             status(mine, lambda message: message["stopped"] is not None)
+            until((folder / "rig.stop").exists)  # which is written after the head is halted
             done.append((folder / "rig.stop").read_text())
             status(mine)
 
