@@ -310,6 +310,7 @@ class Page:
                 await connection.close(REFUSED, "the link is not the newest")
                 return
             self._clients.add(client)
+            client.wake.set()  # the newest picture may be there already
             parts = self._listen, self._send_pictures, self._send_status, self._send_sentences
             tasks = [asyncio.create_task(part(client)) for part in parts]
             try:

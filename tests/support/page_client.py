@@ -96,7 +96,8 @@ def served(session=None):
 def browser(at, token=None, who="a", hello=True):
     """A socket that has said hello."""
     origin = f"http://{LOOPBACK}:{at.port}"
-    with connect(f"ws://{LOOPBACK}:{at.port}/socket", origin=origin, compression=None, max_size=None) as socket:
+    address, end_s = f"ws://{LOOPBACK}:{at.port}/socket", 0.5  # one that reads nothing does not end by itself
+    with connect(address, origin=origin, compression=None, max_size=None, close_timeout=end_s) as socket:
         if hello:
             say(socket, do="hello", token=token or at.page.token, who=who)
         yield socket
