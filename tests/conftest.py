@@ -10,8 +10,8 @@ import pytest
 # Tests run side by side: threads of their own in each would only get into each other's way.
 for _threads in ("OPENBLAS_NUM_THREADS", "LP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):  # algebra, rendering, images
     os.environ.setdefault(_threads, "1")
-# Tests of the wire wait in real time more than they work, so that two cores have room for a third process.
-FEWEST = 3
+# Tests of the wire wait in real time more than they work, so that two cores have room for four processes.
+FEWEST = 4
 
 
 def pytest_xdist_auto_num_workers(config):
