@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.detection.background import WIDE, LargeTargetFinder
-from cotarget.detection.base import LASTING_S, Detections, SizeCheck, Tracks
+from cotarget.detection.background import WIDE, WIDEST_PX, LargeTargetFinder
+from cotarget.detection.base import LASTING_S, Detections, SizeCheck, Tracks, halvings
 from cotarget.detection.exposure import Exposure
 from cotarget.detection.small_target import WEIGHTS, SmallTarget, SmallTargetFinder, Weights
 from cotarget.geometry import Array, intersection_areas
@@ -96,13 +96,14 @@ class AutoDetector:
         """
         self._size.check(frame.image)
         width = frame.image.shape[1]
-        exposure = self._exposure.measure(frame)
+        images = halvings(frame.image, WIDEST_PX)
+        exposure = self._exposure.measure(images[-1], frame.t)
         self._hold(held, width)
         targets, contrast = self._small_finder.find(frame, exposure)
         shift_px = self._register(frame.t, width)
         boxes: list[Detection] = []
         if not self._small_finder.repeated:  # a repeated frame says nothing of where targets usually are
-            boxes = self._boxes(frame, exposure, targets, contrast.boxes, shift_px)
+            boxes = self._boxes(frame, images, exposure, targets, contrast.boxes, shift_px)
         make_mask = contrast.make_mask
         if shift_px is not None and self._large is not None:
             make_mask = partial(_mask, self._large, self._apart)
@@ -111,6 +112,7 @@ class AutoDetector:
     def _boxes(
         self,
         frame: Frame,
+        images: Sequence[Image],
         exposure: float,
         targets: Sequence[SmallTarget],
         boxes: Sequence[Detection],
@@ -121,7 +123,7 @@ class AutoDetector:
         found = small = self._clutter.weigh(boxes, frame.t, width, self._held)
         like = partial(likeness, shape=self._shape)
         if shift_px is not None and self._with_background:
-            self._large = self._large_finder.find(frame, self._held, shift_px, exposure)
+            self._large = self._large_finder.find(frame, self._held, shift_px, exposure, images)
             outlined = [target.whole or target.beside <= PLAIN for target in targets]
             followed = self._are_followed(small, frame.t, width)
             found = fuse(small, outlined, followed, self._large.boxes, like)

@@ -86,6 +86,7 @@ class LargeTargetFinder:
         places: Sequence[tuple[Array, Array]] = (),
         shift_px: Array = STANDING,
         exposure: float = 1.0,
+        images: Sequence[Image] | None = None,
     ) -> Detections:
         """Find large targets, the largest first.
 
@@ -94,8 +95,9 @@ class LargeTargetFinder:
             places: centre and size of places whose background is not learnt, (2,) each [px].
             shift_px: shift of the scene since the background was begun (du, dv) [px], (2,).
             exposure: relative brightness of the image, which is undone.
+            images: the frame's image and its halvings to `WIDEST_PX`, where they are made already.
         """
-        images = halvings(frame.image, WIDEST_PX)
+        images = images or halvings(frame.image, WIDEST_PX)
         factor = 2 ** (len(images) - 1)
         shift = shift_px / factor
         image = moved(np.asarray(cv2.convertScaleAbs(images[-1], alpha=1 / exposure), dtype=np.uint8), -shift)

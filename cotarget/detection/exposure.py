@@ -8,7 +8,7 @@ import numpy as np
 from cotarget.detection.background import HISTORY_S
 from cotarget.detection.base import LASTING_S
 from cotarget.geometry import Array
-from cotarget.rig import Frame
+from cotarget.rig import Image
 
 # Cells along width and height in which brightness is compared.
 CELLS = (32, 24)
@@ -30,20 +30,24 @@ class Exposure:
         self._t = 0.0
         self._changed_t: float | None = None  # since when the picture is another
 
-    def measure(self, frame: Frame) -> float:
-        """Return a frame's brightness over that of the reference; 1 where the picture has changed.
+    def measure(self, image: Image, t: float) -> float:
+        """Return an image's brightness over that of the reference; 1 where the picture has changed.
 
         It is the median ratio over cells of the image, so that a target may cover nearly half of it.
+
+        Args:
+            image: image in a reduced size, (H, W, 3).
+            t: its time [s].
         """
-        cells = cv2.cvtColor(cv2.resize(frame.image, CELLS, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY) + 1.0
+        cells = cv2.cvtColor(cv2.resize(image, CELLS, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY) + 1.0
         if self._reference is None:
-            self._reference, self._t = cells, frame.t
+            self._reference, self._t = cells, t
         ratio = cells / self._reference
         change = float(np.median(ratio))
-        since, self._t = max(0.0, frame.t - self._t), frame.t
+        since, self._t = max(0.0, t - self._t), t
         if np.mean(np.abs(ratio / change - 1) < AGREEMENT) < FEWEST or not DARKEST < change < BRIGHTEST:
-            self._changed_t = frame.t if self._changed_t is None else self._changed_t
-            if frame.t - self._changed_t >= LASTING_S:
+            self._changed_t = t if self._changed_t is None else self._changed_t
+            if t - self._changed_t >= LASTING_S:
                 self._reference, self._changed_t = cells, None
             return 1.0
         self._changed_t = None

@@ -49,7 +49,9 @@ class OnvifUnit:
         with contextlib.ExitStack() as opened:
             film = opened.enter_context(Film(lambda index: plain(FEED_SIZE, index % 200), 1 / RATE_HZ))
             stream, faults = EncodedStream(), Faults(RTSP_FAULTS)
-            opened.enter_context(contextlib.closing(Encoder(film.feed, stream, RATE_HZ, group_s=GROUP_S, faults=faults)))
+            opened.enter_context(
+                contextlib.closing(Encoder(film.feed, stream, RATE_HZ, group_s=GROUP_S, faults=faults))
+            )
             self.stream = opened.enter_context(RtspServer(stream, host=host, faults=faults, **self._user))
             model = OnvifModel(PAN_DEG, TILT_DEG, STEP_DEG, SPEED_DEG_S, 400.0, self.stream.url, FEED_SIZE)
             self.camera = OnvifCamera(self.pan, self.tilt, self.lens, model, self.faults)

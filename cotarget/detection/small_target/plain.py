@@ -48,6 +48,8 @@ def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
     found = []
     for contour in cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
         x, y, w, h = cv2.boundingRect(contour)
+        if unit * max(w, h) < LEAST_PART * width:
+            continue
         contrast = float(sharp[y : y + h, x : x + w].max())
         body = sharp[y : y + h, x : x + w] > max(TIMES * usual, FAINTEST * contrast)
         dx, dy, w, h = cv2.boundingRect(body.astype(np.uint8))
