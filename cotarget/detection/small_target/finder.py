@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, box_detection, halvings, is_clipped, moved
+from cotarget.detection.base import Detections, halvings, moved
 from cotarget.detection.small_target.camera_motion import CameraMotion
 from cotarget.detection.small_target.change import AGES_S, History, changes
 from cotarget.detection.small_target.contrast import (
@@ -202,11 +202,12 @@ def _mask(found: Sequence[Found], shape: tuple[int, ...], times: int) -> Image:
 
 def _boxed(target: SmallTarget, score: float, shape: tuple[int, ...], times: int) -> Detection:
     """Make a detection of a region of an image of a shape (H, W), enlarged by a factor ``times``."""
-    box = box_detection(*target.low, *target.size, score, shape)
+    (x, y), (w, h) = target.low, target.size
     # Interpolation spreads the camera's last pixel over ``times`` pixels.
-    if is_clipped(box.center_px, box.size_px + 2 * (times - 1), shape):
-        box = replace(box, score=min(score, MOST_CLIPPED_SCORE), clipped=True)
-    return replace(box, center_px=(box.center_px + 0.5) / times - 0.5, size_px=box.size_px / times)
+    clipped = x < times or y < times or x + w > shape[1] - times or y + h > shape[0] - times
+    center = np.array([(x + w / 2) / times - 0.5, (y + h / 2) / times - 0.5])
+    most = MOST_CLIPPED_SCORE if clipped else 1.0
+    return Detection(center, np.array([w / times, h / times]), min(score, most), clipped)
 
 
 def _as_a_whole(differing: Found, arrived: list[Found]) -> Found:
