@@ -9,7 +9,7 @@ import bisect
 import math
 import statistics
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
@@ -69,8 +69,10 @@ LARGEST_AREA_RATIO = 10.0
 
 # Window of the larger side [s]: a slow wing beat. With a longer one a bird that flies off counts as nearer than it is.
 BEAT_S = 0.5
-# Quantile of the larger side over that window that counts as its maximum, robust against one wrong frame in ten.
+# Quantile of a side that counts as its maximum, robust against one wrong frame in ten.
 BEAT_PART = 0.9
+# Window of the whole [s]: a drone or a bird may be seen in pieces for a second.
+WHOLE_S = 2.0
 # Largest part of the travel in one step; beyond it the outline jumped to that of another thing.
 LARGEST_STEP = 2 / 3
 # A shorter step is no jump: outlines consist of whole pixels and flicker [px].
@@ -114,12 +116,20 @@ class SizeHistory:
         self.size: Array = np.zeros(2)
         self.larger_side = 0.0
 
+    @property
+    def whole(self) -> Array:
+        """Width and height of the whole target [px], (2,): the usual ones, or the largest where it never shrinks."""
+        if self._trend:
+            return self.size
+        sides = zip(*(size for _, size, _ in self._boxes), strict=True)
+        return np.maximum(self.size, [_quantile(lengths, BEAT_PART) for lengths in sides])
+
     def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
         """Add a box, see `Trail.add`, and update the sizes."""
-        boxes = self._boxes
-        boxes.append((t, size, clipped))
-        while boxes[0][0] < t - self._span_s:
-            boxes.popleft()
+        self._boxes.append((t, size, clipped))
+        while self._boxes[0][0] < t - max(self._span_s, WHOLE_S):
+            self._boxes.popleft()
+        boxes = [box for box in self._boxes if box[0] >= t - self._span_s]
         # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones. One that is far
         # smaller than a cut one shows a part that was seen first, such as a hand.
         largest = max((math.prod(sides) for _, sides, is_cut in boxes if is_cut), default=0.0)
@@ -223,7 +233,7 @@ def _shift(before: Sequence[Edges], after: Sequence[Edges]) -> float:
     return min(map(abs, moved))
 
 
-def _quantile(values: Sequence[float], part: float) -> float:
+def _quantile(values: Iterable[float], part: float) -> float:
     """Quantile with linear interpolation; numpy takes forty times as long."""
     ordered = sorted(values)
     at = part * (len(ordered) - 1)
@@ -437,6 +447,11 @@ class LiveTrack:
     def size(self) -> Array:
         """Usual width and height [px], (2,)."""
         return self._sizes.size
+
+    @property
+    def whole(self) -> Array:
+        """Width and height of the whole target, of which a piece may be seen now [px], (2,)."""
+        return self._sizes.whole
 
     def predict(self, t: float) -> None:
         """Predict the track at time ``t`` [s]."""

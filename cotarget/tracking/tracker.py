@@ -145,8 +145,9 @@ class Tracker:
         on = shared > covered * _area(size)[:, None]
         other = found[:, None] & (LARGER * _area(size)[:, None] < _area(extent))
         free = np.all(~on | other, axis=0)
-        confirmed = np.array([state.confirmed for state in self._tracks], dtype=bool)
-        near = intersection_areas(at[confirmed], NEAR * size[confirmed], center, extent)
+        confirmed = [state for state in self._tracks if state.confirmed]
+        wholes = np.array([state.whole for state in confirmed]).reshape(-1, 2)
+        near = intersection_areas(_boxes_of(confirmed)[0], NEAR * wholes, center, extent)
         free &= np.all(near <= PART * _area(extent), axis=0)
         covers = intersection_areas(center, extent, center, extent) > covered * _area(extent)[:, None]
         for j, detection in enumerate(detections):

@@ -353,6 +353,16 @@ def test_a_box_around_two_birds_for_a_while_does_not_end_their_tracks():
     assert [track.id for track in tracks] == [1, 2]
 
 
+def test_a_drone_that_is_seen_in_two_pieces_for_a_while_is_one_track():
+    """As V_DRONE_067 of the Drone-detection-dataset, whose body is as bright as the sky between its arms."""
+    tracker = Tracker(tracking_settings(MOVING_BIRD), SIZE)
+    for i in range(80):
+        u, v = 100 + 3 * i, 200 + i
+        pieces = [seen(u - 5.5, v - 2, 5, 8), seen(u + 4, v + 2, 8, 6)]
+        tracks = tracker.update(pieces if i % 40 >= 25 else [seen(u, v, 16, 12)], i / RATE)
+    assert [track.id for track in tracks] == [1]
+
+
 def test_a_person_whose_hand_alone_was_whole_when_he_came_into_view_is_one_track():
     """Then the border cut the boxes of his arm and of himself."""
     tracker = Tracker(PLAIN, SIZE)
