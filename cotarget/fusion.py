@@ -21,11 +21,11 @@ from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilt
 from cotarget.estimation.measurement_model import Pose
 from cotarget.estimation.motion_model import GATE, HEAD_SIGMA
 from cotarget.estimation.target_filter import inflated
-from cotarget.estimation.zoom_matching import CloseupFinder, Finder, MatchingSettings, ZoomMeasurement
+from cotarget.estimation.zoom_matching import CloseupFinder, Finder, MatchingSettings, ZoomMeasurement, outline_size
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image, PanTiltState, ZoomState
 from cotarget.targets import Target
-from cotarget.tracking.track import LARGEST_AREA_RATIO, Track, missing, room_inside
+from cotarget.tracking.track import BEAT_S, LARGEST_AREA_RATIO, SizeHistory, Track, missing, room_inside
 
 REMEMBERED_S = 2.0  # longer than any latency [s]
 # States for the cubic interpolation: two before a time and two after it. A straight line through the nearest two is
@@ -141,6 +141,7 @@ class ZoomSearch:
         self._make_finder = partial(finder or partial(CloseupFinder, settings=matching), calibration, profile)
         self._filter = filter or filter_settings(profile, calibration)
         self._settings, self._latest_s, self._closed_loop = settings, matching.latest_s, closed_loop
+        self._matching, self._sizes = matching, SizeHistory(BEAT_S)  # of the followed target's outline [tangent]
         self._least_variance_px = matching.least_sigma_px**2
         self.states = StateHistory()
         self.waiting: deque[Frame] = deque()
@@ -153,7 +154,7 @@ class ZoomSearch:
         """Search for another target from now on; None for none."""
         if target is not self.target:
             self.target = target
-            self.finder, self.unfound_s = self._make_finder(), 0.0
+            self.finder, self.unfound_s, self._sizes = self._make_finder(), 0.0, SizeHistory(BEAT_S)
 
     def add_frame(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
         """Find the followed target in the zoom image, and correct its 3D state by the offset found there.
@@ -186,7 +187,14 @@ class ZoomSearch:
             sigma_px = np.hypot(found.sigma_px, found.body_sigma_px)
             head_sigma = math.hypot(HEAD_SIGMA, pose.sigma, pose.speed * self._settings.time_sigma_s)
             target.filter.add_zoom(
-                found.center_px, sigma_px, pose.pan, pose.tilt, pose.nominal_px, due.t, head_sigma=head_sigma
+                found.center_px,
+                sigma_px,
+                pose.pan,
+                pose.tilt,
+                pose.nominal_px,
+                due.t,
+                head_sigma=head_sigma,
+                size=self._size(due, found, pose, estimate),
             )
         return found
 
@@ -261,6 +269,22 @@ class ZoomSearch:
         found = self.finder.find(frame, estimate.x_fixed, covariance, true)
         self._count_unfound(frame, found, replace(seen, covariance=seen.covariance + head_covariance), estimate)
         return found
+
+    def _size(self, frame: Frame, found: ZoomMeasurement, pose: Pose, estimate: Estimate) -> tuple[float, float] | None:
+        """Measure the wingspan of a target found in a zoom frame [tangent], and its relative standard deviation.
+
+        The fixed camera shows a far bird's body, and a part of a near one before trees. A height is left to the fixed
+        camera, which shows feet and shadow apart as well.
+        """
+        seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
+        if seen is None or not estimate.target.largest_over_time:
+            return None
+        sides_px = outline_size(frame.image, found.center_px, seen.size_px, self._matching)
+        if sides_px is None:
+            return None
+        width, height = (sides_px / seen.focal_px).tolist()
+        self._sizes.add(frame.t, (0.0, 0.0), (width, height), clipped=False)
+        return self._sizes.larger_side, math.hypot(1 / float(sides_px.max()), 1 / self._matching.fine_samples)
 
     def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
         """Count the time for which the zoom image should have shown the target and did not."""

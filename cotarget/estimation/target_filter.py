@@ -59,7 +59,8 @@ class Node:
         rejected_fixed: centres in the fixed image rejected in a row.
         rejected_zoom: centres in the zoom image rejected in a row.
         rejected_size: sizes rejected in a row.
-        size_t: time of the last size measurement [s].
+        size_t: time of the last size in the fixed image [s].
+        zoom_size_t: time of the last size in the zoom image, accepted or not [s].
         fixed_t: time of the last correction by a centre in the fixed image [s]; a start or restart is no correction.
     """
 
@@ -71,6 +72,7 @@ class Node:
     rejected_zoom: int = 0
     rejected_size: int = 0
     size_t: float = -math.inf
+    zoom_size_t: float = -math.inf
     fixed_t: float = -math.inf
 
 
@@ -88,6 +90,8 @@ def sound(node: Node, nearest: float) -> Node | None:
     return replace(node, x=x, P=P)
 
 
+# Time for which a size in the zoom image replaces those of the fixed image: a slow wing beat [s].
+ZOOM_SIZE_S = 0.5
 # An iterated correction ends when the logarithm of the depth changes by less, or after so many iterations.
 CONVERGED, MOST_ITERATIONS = 1e-3, 4
 
@@ -193,16 +197,26 @@ def correct_zoom(node: Node, observed: Observation, sight: SightLine, settings: 
         if abs(x[LOG_DEPTH] - before) < CONVERGED:
             break
     mean_nis = _mean_nis(node, nis, settings)
-    return replace(node, x=x, P=node.P - gain @ PHt.T, mean_nis=mean_nis, rejected_zoom=0)
+    node = replace(node, x=x, P=node.P - gain @ PHt.T, mean_nis=mean_nis, rejected_zoom=0)
+    if observed.log_depth is None:
+        return node
+    # It is the depth in the zoom camera's frame; d[2] is that over the depth in the fixed camera's.
+    observed = replace(observed, log_depth=observed.log_depth - math.log(d[2]))
+    return replace(_correct_size(node, observed, settings), zoom_size_t=node.t)
 
 
 def _correct_size(node: Node, observed: Observation, settings: FilterSettings) -> Node:
     """Correct a node with an apparent size, see `OF_SIZE`."""
     if observed.log_depth is None:
         return node
+    last_t = node.size_t
+    if observed.sight is not None:
+        last_t = node.zoom_size_t
+    elif node.t - node.zoom_size_t < ZOOM_SIZE_S and not observed.bound:  # the zoom camera shows it better
+        return node
     P, h = node.P, OF_SIZE
     # Limbs and wings move the box's sides together for a while, so sizes in quick succession share their error.
-    variance = observed.log_depth_sigma**2 * _variance_factor(node.t - node.size_t, settings.size_s)
+    variance = observed.log_depth_sigma**2 * _variance_factor(node.t - last_t, settings.size_s)
     Ph = P @ h
     S = float(h @ Ph) + variance
     innovation = observed.log_depth - float(h @ node.x)
@@ -218,7 +232,8 @@ def _correct_size(node: Node, observed: Observation, settings: FilterSettings) -
         S = float(h @ Ph) + variance
     x = node.x + Ph * (innovation / S)
     P = P - np.outer(Ph, Ph / S)
-    return replace(node, x=x, P=P, rejected_size=0, size_t=node.size_t if observed.bound else node.t)
+    is_last = observed.sight is None and not observed.bound
+    return replace(node, x=x, P=P, rejected_size=0, size_t=node.t if is_last else node.size_t)
 
 
 def _with_fading_velocity(node: Node, settings: FilterSettings) -> Node:
@@ -364,6 +379,7 @@ class TargetFilter:
         t: float,
         *,
         head_sigma: float = HEAD_SIGMA,
+        size: tuple[float, float] | None = None,
     ) -> bool:
         """Add a centre of the target in the zoom image, which corrects the 3D state, see `correct_zoom`.
 
@@ -376,6 +392,7 @@ class TargetFilter:
             t: exposure time of the frame [s].
             head_sigma: standard deviation of the reported angles [rad]; larger while the head moves and the time is
                 uncertain.
+            size: known dimension in the zoom image [tangent], and its relative standard deviation, if it was measured.
 
         Returns:
             False if the measurement was not added, see `add_fixed`.
@@ -386,7 +403,8 @@ class TargetFilter:
             return False
         z, J = found
         R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * head_sigma**2
-        return self._insert(Observation(t, z, R, self._sight_lines.at(pan, tilt, nominal_px)))
+        log_depth, sigma = (None, math.inf) if size is None else (math.log(self._target.size / size[0]), size[1])
+        return self._insert(Observation(t, z, R, self._sight_lines.at(pan, tilt, nominal_px), log_depth, sigma))
 
     def estimate(self, t: float) -> Estimate | None:
         """Estimate the target at a time [s], after the newest measurement or up to `history_s` before it.

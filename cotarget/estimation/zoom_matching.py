@@ -27,6 +27,7 @@ from cotarget.rig import Detection, Frame, Image
 BODY_SIGMA = {"box": (0.01, 0.01), "upright": (0.03, 0.006), "outline": (0.05, 0.12), None: (0.08, 0.18)}
 # Step for derivatives, in parts of the depth.
 STEP = 1e-3
+LEAST_SQUARE = 8  # smallest square with an outline and its surroundings [samples]
 Pixels = npt.NDArray[np.bool_]
 
 
@@ -329,6 +330,47 @@ def _next_best(score: np.ndarray, place: tuple[int, int], size: Array) -> float:
     others = score.copy()
     others[low[1] : high[1], low[0] : high[0]] = -1.0
     return max(float(others.max()), 0.0)
+
+
+def outline_size(
+    image: Image, center_px: Array, expected_px: float, settings: MatchingSettings = MatchingSettings()
+) -> Array | None:
+    """Measure the outline of a target before a plain background in the zoom image.
+
+    The outline is the largest region whose colour differs from that at the border of a square about the target.
+
+    Args:
+        image: zoom image, (H, W, 3) BGR.
+        center_px: a place in the target's box (u, v), (2,) [px].
+        expected_px: expected larger side of the box [px]; the square reaches as far to each side.
+        settings: settings of the registration.
+
+    Returns:
+        Width and height of the outline, (2,) [px]; None if it reaches the border, lies elsewhere, or is too full or too
+        empty for a target's.
+    """
+    low = np.maximum(np.floor(center_px - expected_px).astype(int), 0)
+    high = np.minimum(np.ceil(center_px + expected_px).astype(int) + 1, image.shape[1::-1])
+    sides = ((high - low) / max(expected_px / settings.fine_samples, 1.0)).astype(int)
+    if (sides < LEAST_SQUARE).any():
+        return None
+    patch = cv2.resize(image[low[1] : high[1], low[0] : high[0]], sides.tolist(), interpolation=cv2.INTER_AREA)
+    border = np.ones(patch.shape[:2], dtype=bool)
+    border[1:-1, 1:-1] = False
+    background = patch[border]
+    away = (patch - np.median(background, axis=0)) @ _whitening(background, settings)
+    differs = np.sum(away**2, axis=2) > GATE
+    count, _, stats, _ = cv2.connectedComponentsWithStats(differs.astype(np.uint8))
+    if count == 1:  # the background alone
+        return None
+    left, top, width, height, area = stats[1 + np.argmax(stats[1:, cv2.CC_STAT_AREA])].tolist()
+    first, size, at = np.array([left, top]), np.array([width, height]), (center_px - low) * sides / (high - low)
+    least, most = settings.foreground
+    is_whole = (first > 0).all() and (first + size < sides).all()
+    is_there = (at >= first).all() and (at <= first + size).all()
+    return (
+        np.asarray(size * (high - low) / sides) if is_whole and is_there and least < area / size.prod() < most else None
+    )
 
 
 class Finder(Protocol):

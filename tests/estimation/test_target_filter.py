@@ -26,6 +26,7 @@ from tests.support.rigs import rig_of, with_zoom_head
 
 TRIANGULATED = 0.15  # of the logarithm of a depth by 0.4 m of baseline, 0.1 foretold, and half as much for three runs
 CLEARLY = 0.6  # of an error that is clearly larger; the depth of three flights comes to 0.36 of it
+BY_OUTLINES = 0.1  # of an apparent size: sizes of 3 % outweigh those of half as large boxes, at a third of their weight
 JUMP_PX = 200.0  # beyond any motion from frame to frame
 SOON = 0.03  # of how long an error lasts
 HARDLY = 0.95  # a further measurement that errs alike takes so little away; an independent one takes a third
@@ -120,6 +121,27 @@ def test_the_zoom_camera_refines_the_depth():
         off[zoom] = float(np.sqrt(np.mean(np.square(found))))
     assert off[True] < TRIANGULATED
     assert off[True] < CLEARLY * off[False]
+
+
+def test_the_zoom_cameras_size_outweighs_a_part_in_the_fixed_image():
+    """Of a bird in flight the fixed camera outlines half; the zoom camera measures the whole wingspan to 3 %."""
+    flight = Flight("bird", 300)
+    ends = []
+    for sized in (False, True):
+        estimator = TargetFilter(flight.calibration, flight.target)
+        for t in flight.times:
+            box = flight.wide(t)
+            if box is not None:
+                estimator.add_fixed(replace(box, size_px=box.size_px / 2), t)
+            view = flight.zoom(t + APART)
+            if view is not None:
+                span = flight.size / float(flight.path(view.t)[2])
+                at = view.pixel, view.sigma_px, view.pan, view.tilt, view.nominal_px, view.t
+                estimator.add_zoom(*at, size=(span, 0.03) if sized else None)
+        estimate = estimator.estimate(view.t)
+        ends.append(estimate.wanted_size.size / estimate.depth * float(flight.path(view.t)[2]))
+    assert ends[0] < CLEARLY * flight.size
+    assert ends[1] == pytest.approx(flight.size, rel=BY_OUTLINES)
 
 
 def test_the_targets_motion_decides_how_it_is_predicted_whatever_its_matcher():

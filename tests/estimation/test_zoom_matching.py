@@ -13,7 +13,7 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.demo import SCENES, sim_config
 from cotarget.estimation.correlation import correlate, resample, summit
 from cotarget.estimation.measurement_model import Pose
-from cotarget.estimation.zoom_matching import CloseupFinder, look
+from cotarget.estimation.zoom_matching import CloseupFinder, look, outline_size
 from cotarget.evaluation import true_calibration
 from cotarget.geometry import pose
 from cotarget.rig import Detection, Frame
@@ -27,6 +27,7 @@ FOCAL, CENTER, DISTORTION = 690.0, (319.5, 239.5), np.array([-0.2, 0.0, 0.0, 0.0
 BASELINE = 0.4  # [m]
 SIGMA_PX = 20.0  # of the expected place in the zoom image: 2 m of 10 m in depth at 700 px
 REGISTERED_PX = 0.25  # of the fixed image: a sixtieth of the smallest target below
+OUTLINED = 0.06  # of an outline's side, in parts of the expected one: two of forty samples, and their edges
 BIRD = DEFAULT_TARGETS["bird"]
 # A bird with a wing up, seen from the side, in metres about its middle.
 OUTLINE = np.array(
@@ -131,6 +132,24 @@ def test_a_target_is_registered_at_any_focal_length_and_roll(nominal, roll_deg):
     assert error < 4 * found.sigma_px * FOCAL / nominal
     # A wing moves the body's centre, which is no error of the registration.
     assert (found.body_sigma_px > found.sigma_px / 4).all()
+
+
+@pytest.mark.parametrize("wrong", [0.6, 1.0, 1.7])
+@pytest.mark.parametrize("nominal", [1800.0, 4000.0, 7500.0])
+def test_an_outline_is_measured_whatever_size_is_expected(nominal, wrong):
+    scene = Scene([(1.5, -1.0, 20.0)], nominal)
+    size_px = np.ptp(OUTLINE, axis=0) * nominal / 20.0
+    found = outline_size(scene.zoom().image, scene.zoom_px(scene.birds[0])[0], wrong * size_px.max())
+    assert found == pytest.approx(size_px, abs=OUTLINED * wrong * size_px.max())
+
+
+def test_what_is_no_whole_outline_measures_no_size():
+    scene = Scene([(1.5, -1.0, 20.0)])
+    zoom, at = scene.zoom().image, scene.zoom_px(scene.birds[0])[0]
+    larger_px = np.ptp(OUTLINE, axis=0).max() * scene.nominal / 20.0
+    assert outline_size(zoom, at, 0.4 * larger_px) is None  # it fills the square
+    assert outline_size(zoom, at + 1.4 * larger_px, 2.0 * larger_px) is None  # beside it
+    assert outline_size(scene.zoom(which=[]).image, at, larger_px) is None
 
 
 def test_nothing_is_found_in_an_empty_zoom_image():
