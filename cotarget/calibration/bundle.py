@@ -675,7 +675,7 @@ def fit(
     about the reported ones, independent for each view [rad].
 
     Raises:
-        CalibrationError: there are no views, or a board ends behind a camera.
+        CalibrationError: there are no views, or a board begins or ends behind a camera.
     """
     if not views:
         raise CalibrationError("no views of the board to fit")
@@ -683,7 +683,7 @@ def fit(
     problem = Problem(batches_of(model, views), points, tuple(free), prior, jitter)
     here = problem.at(model)
     damping = DAMPING
-    for _ in range(STEPS):
+    for _ in range(STEPS if here.finite else 0):
         scale = robust_scale(here)
         equations = problem.equations(here, scale)
         cost = problem.cost(here, scale)

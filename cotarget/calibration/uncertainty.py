@@ -113,16 +113,16 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
         ]
         try:
             partial = fit(found.model, rest, points, found.free, prior=prior, jitter=found.jitter)
-        except CalibrationError:
+            started = replace(partial, model=replace(partial.model, boards=found.model.boards))
+            left.append(fit(started.model, kept, points, ()).residuals)
+        except CalibrationError:  # also where a board is behind a camera by the rig of the others
             return None
         covariance = covariance_of(partial)
         if covariance is None or partial.variance is None:
             return None
-        started = replace(partial, model=replace(partial.model, boards=found.model.boards))
         more_misses, more_expected = _predicted(started, covariance.matrix, kept, points)
         misses.append(more_misses)
         expected.append(more_expected)
-        left.append(fit(started.model, kept, points, ()).residuals)
     miss, covariances = np.concatenate(misses), np.concatenate(expected)
     predicted_px = float(np.sqrt(np.mean(np.trace(covariances, axis1=1, axis2=2))))
     if predicted_px > DETERMINED * found.model.head.lens.size[0]:

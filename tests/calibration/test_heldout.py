@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from cotarget.calibration import Calibration, predicted_pointing
+from cotarget.calibration.bundle import fit
 from cotarget.calibration.planning import ACCURACY_GRID, BORDER, DEPTHS_SQUARES, planned_views, predict_accuracy
 from cotarget.calibration.uncertainty import covariance_of, cross_validate, model_of
+from cotarget.errors import CalibrationError
+from cotarget.geometry import RigidTransform
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Truth, other_rig, truth_of
 from experiments.calibration.synthetic.views import Placing, synthetic_views
 from tests.support.synthetic_calibration import BOARD, NOISE_PX, POINTS, calibrated, drawn, drawn_at_stops, fitted
@@ -129,6 +132,15 @@ def test_undetermined_folds_give_no_held_out_check():
     start = model_of(calibrated(views, sizes=dict.fromkeys(("fixed", "zoom"), (640 * finer, 480 * finer))))
     again = cross_validate(fitted(start, views), POINTS, None, folds=5)
     assert again.predicted_px == pytest.approx(finer * predicted_px, rel=SAME_FIT)
+
+
+def test_a_board_that_begins_behind_a_camera_ends_the_fit():
+    """As a held-out board may, by the rig of too few others; its corners have no pixels there."""
+    views = drawn(Truth(), 0, boards=4)
+    model = fitted(model_of(calibrated(views)), views).model
+    behind = {n: RigidTransform.from_components(-T.translation, T.rotation) for n, T in model.boards.items()}
+    with pytest.raises(CalibrationError, match="behind a camera"):
+        fit(replace(model, boards=behind), views, POINTS, ())
 
 
 INVERTED = 1e-6  # relative: normal matrices of ten orders of magnitude, inverted in two ways
