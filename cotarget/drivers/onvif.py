@@ -26,6 +26,7 @@ from urllib.parse import urlsplit
 from xml.etree.ElementTree import Element
 
 from cotarget.drivers.axes import AXES, AxisFacts, Poll
+from cotarget.drivers.guardian import Order
 from cotarget.drivers.head_link import Pair, Requests
 from cotarget.drivers.link_errors import CutError, RefusedError, SilentError
 from cotarget.drivers.polled_head import UNHEARD_S
@@ -298,6 +299,12 @@ class OnvifDevice:
         """Send a command; raises as `SoapClient.call` does."""
         self._ask(self._ptz, PTZ, message, self._token + inner, timeout)
 
+    def order(self, message: str, inner: str) -> Order:
+        """Write a command for a `Guardian`."""
+        host, _, port = self._address.rpartition(":")
+        signed = self.soap.signed(self._ptz, PTZ, message, self._token + inner)
+        return False, host.strip("[]"), int(port), [signed.decode("latin-1")]
+
     @property
     def _token(self) -> str:
         return f"<ProfileToken>{self.profile}</ProfileToken>"
@@ -310,7 +317,8 @@ class OnvifDevice:
         tried, errors = ([settings.port] if settings.port else list(PORTS)), list[DeviceError]()
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         for port in tried:
-            soap = SoapClient(f"{host}:{port}", settings.user, password, self._remedy)
+            self._address = f"{host}:{port}"
+            soap = SoapClient(self._address, settings.user, password, self._remedy)
             try:
                 soap.call(DEVICE_PATH, DEVICE, "GetSystemDateAndTime", timeout=ASK_S)
             except LoginFaultError:  # it wants a user even for its time
@@ -572,6 +580,7 @@ class OnvifLink(PtzLink):
 
     def close(self) -> None:
         """Release the connections; never raises."""
+        super().close()
         self._reader.close()
         self._workers.close()
         self._device.soap.close()
@@ -723,6 +732,7 @@ class OnvifLink(PtzLink):
         due = any(wanted) and now - self._renewed > (self._timeout_s or TIMEOUT_S) / 2
         if same and not due:
             return
+        self.guard([self._device.order(*order) for order in self._stops] if any(wanted) else [])
         velocity = self._velocity(wanted[0] / fastest, wanted[1] / fastest)
         timeout = f"<Timeout>PT{self._timeout_s:g}S</Timeout>" if self._timeout_s else ""
         try:
@@ -741,11 +751,17 @@ class OnvifLink(PtzLink):
         space = self._device.abilities.space("ContinuousPanTiltVelocitySpace")
         return f"<Velocity>{speeds_in(space, pan, tilt)}</Velocity>"
 
-    def _stop(self, deadline: float) -> None:
-        """Stop by a stop and by velocities of zero, since devices may ignore one; repeat each until it is answered."""
+    @property
+    def _stops(self) -> list[tuple[str, str]]:
+        """What stops it: a stop, and velocities of zero, since devices may ignore one of them."""
         orders = [("Stop", "<PanTilt>true</PanTilt><Zoom>false</Zoom>")]
         if self._device.abilities.space("ContinuousPanTiltVelocitySpace"):
             orders.append(("ContinuousMove", self._velocity(0.0, 0.0)))
+        return orders
+
+    def _stop(self, deadline: float) -> None:
+        """Stop; repeat each order until it is answered."""
+        orders = self._stops
         faults, count = list[BaseException](), len(orders)
         while orders:
             answers = [self._workers.submit(partial(self._device.command, *order, STOP_S)) for order in orders]
@@ -761,6 +777,8 @@ class OnvifLink(PtzLink):
         if len(faults) == count:
             why = f"; {RIGHTS}" if isinstance(faults[0], LoginFaultError) else ""
             raise DeviceError(f"{self.name} does not stop: {faults[0]}{why}") from faults[0]
+        if self._is_steered:
+            self.guard([])
         self._due = now = self._clock.now()
         for steered in self._steered:
             steered.stop(now)

@@ -16,6 +16,7 @@ units, ranges, steps and speeds of pan, tilt and zoom, in the device's own numbe
 
 import contextlib
 import itertools
+import logging
 import math
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -25,6 +26,7 @@ from annotated_types import Interval, Lt
 from cotarget.config import SafetyConfig
 from cotarget.drivers.axes import AxisFacts
 from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.guardian import Guardian, Order
 from cotarget.drivers.head_link import HeadLink
 from cotarget.drivers.lens import LensPositions
 from cotarget.drivers.polled_head import (
@@ -39,6 +41,8 @@ from cotarget.drivers.stream import EXAMPLE, StreamCamera, StreamSettings, strea
 from cotarget.errors import ConfigError
 from cotarget.rig import Clock, Frame, UnitSpec, ZoomSpec, ZoomState
 from cotarget.schema import Check, Limits, Needed, NotNegative, Positive, Size, model
+
+log = logging.getLogger(__name__)
 
 Knots = tuple[tuple[float, float], ...]  # (zoom number, magnification)
 USUAL_KNOTS: Knots = ((0.0, 1.0), (1.0, 20.0))  # at the ends of a device's own range
@@ -131,10 +135,25 @@ class PtzLink(HeadLink):
     axes: tuple[AxisFacts, AxisFacts, AxisFacts]
     identity: str = ""
     url: str = ""
+    _guardian: Guardian | None = None
 
     def make_ready(self) -> None:
         """Halt the device and set it up for moves; by default only the halt."""
         self.halt(LOOP_HALT_S + braking_s(self.axes))
+
+    def guard(self, orders: list[Order]) -> None:
+        """Have a process of its own send orders if this program is killed; none for a device that then stands."""
+        try:
+            if self._guardian is None:
+                self._guardian = Guardian()
+            self._guardian.hold(orders)
+        except OSError as error:
+            log.warning("%s: nothing stops it if this program is killed: %s", self.name, error)
+
+    def close(self) -> None:
+        """End the process of `guard`; a subclass releases its connection too."""
+        if self._guardian is not None:
+            self._guardian.close()
 
 
 class DomeCamera:

@@ -235,25 +235,41 @@ class SoapClient:
         # Devices say whole seconds.
         return 0.0 if found is None else (found - datetime.now(UTC)).total_seconds() + 0.5
 
+    def signed(self, path: str, namespace: str, message: str, inner: str = "") -> bytes:
+        """Write a message with its HTTP header, for another connection, which is closed after the answer.
+
+        It is signed for now: devices take it for some seconds or minutes. Arguments are those of `call`.
+        """
+        request = next(self._auth.sync_auth_flow(self._request(path, namespace, message, inner, self._header())))
+        headers = {**request.headers, "connection": "close"}
+        lines = [f"POST {path} HTTP/1.1", *(f"{name}: {value}" for name, value in headers.items()), "", ""]
+        return "\r\n".join(lines).encode() + bytes(request.content)
+
     def _exchange(self, path: str, namespace: str, message: str, inner: str, deadline: float) -> Element:
-        header = ""
-        if self._user:
-            created = datetime.now(UTC) + timedelta(seconds=self.clock_off_s)
-            header = user_token(self._user, self._password, created, os.urandom(16))
-        return self._post(path, namespace, message, inner, header, deadline)[0]
+        return self._post(path, namespace, message, inner, self._header(), deadline)[0]
+
+    def _header(self) -> str:
+        """Write the security header of now; empty without a user."""
+        if not self._user:
+            return ""
+        created = datetime.now(UTC) + timedelta(seconds=self.clock_off_s)
+        return user_token(self._user, self._password, created, os.urandom(16))
+
+    def _request(self, path: str, namespace: str, message: str, inner: str, header: str) -> "httpx.Request":
+        data = (
+            f'<?xml version="1.0" encoding="utf-8"?><s:Envelope xmlns:s="{ENVELOPE}">{header}<s:Body>'
+            f'<{message} xmlns="{namespace}" xmlns:t="{SCHEMA}">{inner}</{message}></s:Body></s:Envelope>'
+        )
+        kind = f'application/soap+xml; charset=utf-8; action="{namespace}/{message}"'
+        return self._client.build_request("POST", path, content=data.encode(), headers={"Content-Type": kind})
 
     def _post(
         self, path: str, namespace: str, message: str, inner: str, header: str, deadline: float
     ) -> tuple[Element, datetime | None]:
         """Send an envelope; return the root of the answer, and the time in its header `Date`."""
         httpx = self._httpx
-        data = (
-            f'<?xml version="1.0" encoding="utf-8"?><s:Envelope xmlns:s="{ENVELOPE}">{header}<s:Body>'
-            f'<{message} xmlns="{namespace}" xmlns:t="{SCHEMA}">{inner}</{message}></s:Body></s:Envelope>'
-        )
-        kind = f'application/soap+xml; charset=utf-8; action="{namespace}/{message}"'
         with self._one_line_errors(message):
-            request = self._client.build_request("POST", path, content=data.encode(), headers={"Content-Type": kind})
+            request = self._request(path, namespace, message, inner, header)
             steps = self._auth.sync_auth_flow(request)
             with contextlib.suppress(StopIteration):
                 request = next(steps)

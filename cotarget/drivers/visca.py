@@ -156,8 +156,9 @@ class ViscaLink(PtzLink):
             opened.pop_all()
 
     def make_ready(self) -> None:
-        """Halt the camera, and switch its digital zoom off."""
+        """Halt the camera, have it halted if the program is killed, and switch its digital zoom off."""
         super().make_ready()
+        self.guard([self._line.last_stop()])
         with contextlib.suppress(RefusedError):  # a camera without it
             self._line.order(protocol.DIGITAL_ZOOM_OFF)
 
@@ -199,6 +200,7 @@ class ViscaLink(PtzLink):
 
     def close(self) -> None:
         """Release the connection."""
+        super().close()
         self._line.close()
 
     def _send(self, command: bytes, requests: Requests, before: int) -> int:

@@ -18,6 +18,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from cotarget.drivers.guardian import Order
 from cotarget.drivers.link_errors import LostError, RefusedError, ReplyError, SilentError
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.rig import Clock
@@ -347,6 +348,15 @@ class Line:
                 if self._clock.now() >= end:
                     raise
             self._clock.sleep_until(self._clock.now() + BUSY_PAUSE_S)
+
+    def last_stop(self) -> Order:
+        """Write a stop for a `Guardian`: with Sony's header the first message after a reset of the counter."""
+        host, port, *_ = self._socket.getpeername()
+        messages = [STOP]
+        if self.transport.header:
+            messages = [pack(CONTROL, 0, RESET), pack(COMMAND, FIRST, STOP)]
+        is_udp = self.transport.kind == socket.SOCK_DGRAM
+        return is_udp, host, port, [message.decode("latin-1") for message in messages]
 
     def cancel(self, places: Sequence[int]) -> None:
         """Cancel the commands in the camera's sockets; waits for no answer."""
