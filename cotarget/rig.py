@@ -258,10 +258,18 @@ class ZoomSpec(CameraSpec):
 
 @dataclass(frozen=True)
 class HeadSpec:
-    """Properties of a head: its limits, and the time from a command to the start of its motion [s]."""
+    """Properties of a head.
+
+    Attributes:
+        limits: of its axes.
+        delay_s: time from a command to the start of motion [s].
+        zoomed_speeds: (nominal focal length [px], highest speed from there on [rad/s]), by increasing focal length, of
+            a head that turns the slower the longer its lens; empty for others.
+    """
 
     limits: PanTiltLimits
     delay_s: float
+    zoomed_speeds: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,8 @@ class Controller:
         head = head or HeadSettings()
         self._rig, self._calibration, self._predict = rig, calibration, predict
         shortest, longest = (self._true(nominal) for nominal in rig.zoom.focal_range)
-        self._zoom = ZoomController((shortest, longest), rig.zoom.size, zoom or ZoomSettings())
+        speeds = [(self._true(nominal), speed) for nominal, speed in rig.spec.head.zoomed_speeds]
+        self._zoom = ZoomController((shortest, longest), rig.zoom.size, zoom or ZoomSettings(), speeds)
         self._head_controller = HeadController(rig.head.limits, head)
         state = rig.head.state()
         self.commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
@@ -81,6 +82,7 @@ class Controller:
             self._true(focal),
             now,
             self._true(self._rig.zoom.state().focal_px),
+            max(abs(then.pan - first.pan), abs(then.tilt - first.tilt)) / interval,
         )
         nominal = self._calibration.zoom_head.lens.nominal_for(focal_px)
         if abs(math.log(nominal / focal)) > NO_CHANGE:

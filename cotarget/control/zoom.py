@@ -3,12 +3,14 @@
 The lens zooms in to the wanted size, but no further than the whole target is in the next zoom frame with a probability
 of 95 %; it zooms out below 80 %. Probabilities are for the first frame that a command can change, even if the lens
 travels longer, because the next frame corrects it on its way. The comparison: docs/design-notes.md.
+Where the head turns the slower the longer the lens is, the lens zooms in no further than the head can follow.
 
 No device and no clock are used: angles are tangents at the zoom camera, and the caller gives the times. Focal lengths
 are true ones [px].
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from scipy.optimize import brentq
@@ -30,12 +32,16 @@ class ZoomSettings:
         rim_px: margin at the image's border that the target must not enter [px].
         deadband: relative change of the focal length below which the lens is not commanded.
         settle_s: time after a forced zoom out in which the lens does not zoom in [s].
+        speed_share: part of the head's highest speed that the target may take; the rest is for catching up.
+        speed_s: time in which a target's highest speed is forgotten, so that the lens does not hunt [s].
     """
 
     sure: float = 0.95
     rim_px: float = 4.0
     deadband: float = 0.06
     settle_s: float = 0.3
+    speed_share: float = 0.8
+    speed_s: float = 3.0
 
 
 def is_seen_well(
@@ -110,7 +116,11 @@ class ZoomController:
     """Decide on the focal length in every frame, with hysteresis, so that the lens does not hunt."""
 
     def __init__(
-        self, focal_range: tuple[float, float], size: tuple[int, int], settings: ZoomSettings = ZoomSettings()
+        self,
+        focal_range: tuple[float, float],
+        size: tuple[int, int],
+        settings: ZoomSettings = ZoomSettings(),
+        speeds: Sequence[tuple[float, float]] = (),
     ) -> None:
         """Create a controller without history.
 
@@ -118,11 +128,15 @@ class ZoomController:
             focal_range: shortest and longest focal length [px].
             size: (width, height) of the zoom image [px].
             settings: settings of the controller.
+            speeds: (focal length [px], highest speed of the head from there on [rad/s]), by increasing focal length;
+                empty for a head whose speed does not depend on the lens.
         """
         self._range = focal_range
         self._size = size
         self._settings = settings
+        self._speeds = speeds
         self._out_t = -math.inf
+        self._rate, self._rate_t = 0.0, -math.inf  # highest rate of the target, forgotten by and by
 
     def choose(
         self,
@@ -131,6 +145,7 @@ class ZoomController:
         commanded_px: float,
         t: float,
         now_px: float | None = None,
+        rate: float = 0.0,
     ) -> tuple[float, str]:
         """Decide on the focal length.
 
@@ -140,18 +155,21 @@ class ZoomController:
             commanded_px: focal length commanded last [px].
             t: time now [s].
             now_px: focal length now [px]; the commanded one by default.
+            rate: angle a second by which the faster axis of the head has to turn after the target [rad/s].
 
         Returns:
-            The focal length [px], and the reason: "wanted", "unsure", "about to be lost", "settling" or "lost".
+            The focal length [px], and the reason: "wanted", "unsure", "head too slow", "about to be lost", "settling"
+            or "lost".
         """
         if seen is None:
             self._out_t = t
             return self._range[0], "lost"
         settings, size = self._settings, self._size
-        wanted = min(max(wanted_px, self._range[0]), self._range[1])
+        fast_px = self._longest_for(rate, t)
+        wanted = min(max(wanted_px, self._range[0]), fast_px)
         sure = longest_focal(seen, settings.sure, size, self._range, settings.rim_px)
         goal = min(wanted, sure)
-        reason = "wanted" if wanted <= sure else "unsure"
+        reason = "unsure" if wanted > sure else "head too slow" if wanted == fast_px < wanted_px else "wanted"
         change = math.log(goal / commanded_px)
         if change > settings.deadband:
             if t - self._out_t < settings.settle_s:
@@ -165,6 +183,15 @@ class ZoomController:
         if math.log(wanted / commanded_px) < -settings.deadband:
             return goal, reason
         return commanded_px, reason
+
+    def _longest_for(self, rate: float, t: float) -> float:
+        """Find the longest focal length at which the head is fast enough for a rate [px]."""
+        kept = math.exp(-(t - self._rate_t) / self._settings.speed_s)
+        self._rate, self._rate_t = max(rate, kept * self._rate), t
+        shortest, longest = self._range
+        slow = (px for px, speed in self._speeds if self._settings.speed_share * speed < self._rate)
+        # At such a focal length itself the head is slow already.
+        return max(min((math.exp(-self._settings.deadband) * px for px in slow), default=longest), shortest)
 
 
 def _below(value: float, sigma: float) -> float:

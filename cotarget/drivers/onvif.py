@@ -30,7 +30,7 @@ from cotarget.drivers.guardian import Order
 from cotarget.drivers.head_link import Pair, Requests
 from cotarget.drivers.link_errors import CutError, RefusedError, SilentError
 from cotarget.drivers.polled_head import UNHEARD_S
-from cotarget.drivers.ptz import Dome, PtzLink, PtzSettings
+from cotarget.drivers.ptz import Dome, PtzLink, PtzSettings, lens_positions
 from cotarget.drivers.soap import (
     DEVICE,
     DEVICE_PATH,
@@ -592,7 +592,7 @@ class OnvifLink(PtzLink):
         abilities, who = self._device.abilities, self._who
         if not abilities.space("AbsoluteZoomPositionSpace") and abilities.spaces:
             raise DeviceError(f"{who} has no zoom that goes to positions: it is not driven")
-        if abilities.space("AbsolutePanTiltPositionSpace"):
+        if abilities.space("AbsolutePanTiltPositionSpace") and self._settings.absolute:
             return False
         if not abilities.space("ContinuousPanTiltVelocitySpace"):
             by = "steps" if abilities.space("RelativePanTiltTranslationSpace") else "presets"
@@ -712,6 +712,16 @@ class OnvifLink(PtzLink):
         goal = self._goals[axis] if self._goals[axis] is not None else place
         return self._reckoned[axis].at(now)[0] if goal is None else goal
 
+    @property
+    def _fastest_deg_s(self) -> float:
+        """Speed at which the device turns at full speed, at the zoom of now [degrees/s]."""
+        settings, number = self._settings, self._positions(self._seen)[2]
+        if not settings.zoomed_speeds:
+            return settings.speed_deg_s
+        if number is None:
+            number, _ = self._reckoned[2].at(self._clock.now())
+        return settings.fastest_deg_s(lens_positions(settings, self.axes[2]).focal_at(number) / settings.wide_px)
+
     def _steer(self, requests: Requests, is_blind: bool = False) -> None:
         """Send the velocities that lead to the goals, where they change, or before the device ends them by itself.
 
@@ -724,7 +734,8 @@ class OnvifLink(PtzLink):
         wanted = [axis.wanted(at, self._seen.t, now) for axis, at in zip(self._steered, (pan, tilt), strict=True)]
         if is_blind:
             wanted = [0.0, 0.0]
-        fastest = self._settings.speed_deg_s
+        fastest = self._fastest_deg_s
+        wanted = [min(max(speed, -fastest), fastest) for speed in wanted]
         same = all(
             abs(speed - axis.velocity) <= FINE * fastest and (speed == 0) == (axis.velocity == 0)
             for speed, axis in zip(wanted, self._steered, strict=True)

@@ -18,6 +18,7 @@ import contextlib
 import itertools
 import logging
 import math
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -54,6 +55,12 @@ def _knots(lens: Knots) -> Knots:
     return lens
 
 
+def _zoomed(speeds: Knots) -> Knots:
+    if any(b[0] <= a[0] or b[1] > a[1] for a, b in itertools.pairwise(speeds)):
+        raise ValueError("needs [magnification, degrees/s], with increasing magnifications and no speed above the last")
+    return speeds
+
+
 @model
 class PtzSettings(PolledHeadSettings):
     """A camera with pan, tilt and zoom behind one address.
@@ -73,6 +80,8 @@ class PtzSettings(PolledHeadSettings):
         lens: some zoom numbers and their magnifications, both increasing; between them the logarithm of the
             magnification is interpolated. Empty for the protocol's own table.
         step_deg: step size of pan and tilt, or of each; 0 for what the protocol or the device says [degrees].
+        zoomed_speeds: some magnifications, increasing, and the highest speed of pan and tilt from there on, of a dome
+            that turns the slower the longer its lens [degrees/s]; empty for others.
         command_delay_s: time from a command to the start of motion of head and lens, as measured [s].
     """
 
@@ -93,6 +102,9 @@ class PtzSettings(PolledHeadSettings):
     tilt_deg: Limits = (-30.0, 90.0)
     speed_deg_s: Positive = 80.0
     command_delay_s: NotNegative = 0.1
+    zoomed_speeds: Annotated[
+        tuple[Annotated[tuple[Positive, Positive], "[magnification, degrees/s]"], ...], Check(_zoomed)
+    ] = ()
 
     @property
     def address(self) -> str:
@@ -116,7 +128,13 @@ class PtzSettings(PolledHeadSettings):
         (_, least), *_, (_, most) = self.knots
         focal_range = (least * self.wide_px, most * self.wide_px)
         zoom = ZoomSpec(self.size, self.rate_hz, self.latency_s, focal_range, self.size, self.command_delay_s)
-        return UnitSpec(zoom, super().spec)
+        speeds = tuple((times * self.wide_px, math.radians(speed)) for times, speed in self.zoomed_speeds)
+        return UnitSpec(zoom, replace(super().spec, zoomed_speeds=speeds))
+
+    def fastest_deg_s(self, magnification: float) -> float:
+        """Return the highest speed of pan and tilt at a magnification [degrees/s]."""
+        slower = [speed for times, speed in self.zoomed_speeds if times <= magnification]
+        return min(self.speed_deg_s, *slower[-1:], math.inf)
 
     def stream(self, url: str = "") -> StreamSettings:
         """Make the settings of its stream; ``url`` where the device says it and the file does not."""

@@ -207,6 +207,7 @@ def spec_table(spec: RigSpec) -> dict[str, Any]:
         "zoom_pitch_mm": zoom.pitch_mm and _plain(zoom.pitch_mm),
         "zoom_delay_s": _plain(zoom.delay_s),
         "head_delay_s": _plain(spec.head.delay_s),
+        **({"head_zoomed_speeds": [list(each) for each in spec.head.zoomed_speeds]} if spec.head.zoomed_speeds else {}),
     }
 
 
@@ -252,7 +253,8 @@ def parse_spec(table: Mapping[str, Any], described: Callable[[], RigSpec]) -> Ri
         rates = {key: float(table[f"zoom_{key}"]) for key in ("rate_hz", "latency_s", "delay_s")}
         pitch_mm = None if table["zoom_pitch_mm"] is None else float(table["zoom_pitch_mm"])
         zoom = ZoomSpec(zoom_size, focal_range=focal_range, still_size=still_size, pitch_mm=pitch_mm, **rates)
-        head = HeadSpec(limits, float(table["head_delay_s"]))
+        speeds = tuple((float(focal), float(speed)) for focal, speed in table.get("head_zoomed_speeds", ()))
+        head = HeadSpec(limits, float(table["head_delay_s"]), speeds)
     else:
         spec = described()
         fixed = replace(spec.fixed, size=fixed_size)

@@ -49,6 +49,25 @@ def test_the_longest_focal_length_has_the_chance_asked_for():
     assert longest_focal(expected(1e-9, half=(1e-4, 1e-4)), 0.95, SIZE, RANGE) == RANGE[1]
 
 
+def test_the_lens_is_no_longer_than_the_head_can_follow():
+    """At 2000 px the head turns by 0.1 rad/s at most, and at 4000 px by 0.02."""
+    policy = ZoomController(RANGE, SIZE, speeds=((2000.0, 0.1), (4000.0, 0.02)))
+    t, commanded, way = 0.0, RANGE[0], []
+    for rate in [0.01] * 50 + [0.05] * 50 + [0.2] * 50 + [0.01] * 50:
+        commanded, reason = policy.choose(expected(0.001), 6000.0, commanded, t, rate=rate)
+        way.append((commanded, reason))
+        t += FRAME
+    assert way[49] == (6000.0, "wanted")
+    assert 3600.0 < way[51][0] < 4000.0
+    assert way[51][1] == "head too slow"
+    assert 1800.0 < way[101][0] < 2000.0
+    assert way[155][0] == way[101][0]  # the target may only have turned around
+    for _ in range(400):
+        commanded, reason = policy.choose(expected(0.001), 6000.0, commanded, t, rate=0.01)
+        t += FRAME
+    assert (commanded, reason) == (6000.0, "wanted")
+
+
 def test_wide_while_unsure_close_when_sure_and_out_before_it_is_lost():
     policy = ZoomController(RANGE, SIZE)
     commanded, t, way = RANGE[0], 0.0, []
