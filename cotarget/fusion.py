@@ -198,6 +198,12 @@ class ZoomSearch:
             )
         return found
 
+    def expect(self, t: float) -> Appearance | None:
+        """Predict how the followed target appears in a zoom frame of time t [s]; None if that is not known."""
+        estimate = None if self.target is None else self.target.estimate(t)
+        pose = self.states.interpolate(t)
+        return None if pose is None or estimate is None else estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
+
     def warnings(self, estimate: Estimate | None) -> list[str]:
         """Describe what contradicts the nominal size of the followed target or the calibration, a sentence each.
 

@@ -34,7 +34,7 @@ from cotarget.errors import (
     choices,
     naming,
 )
-from cotarget.estimation import Estimate, FilterSettings, filter_settings
+from cotarget.estimation import Appearance, Estimate, FilterSettings, filter_settings
 from cotarget.estimation.zoom_matching import MatchingSettings, ZoomMeasurement
 from cotarget.fusion import FusionSettings, MakeFinder, TargetFusion, ZoomSearch
 from cotarget.rig import (
@@ -311,6 +311,7 @@ class Step:
         estimate: 3D estimate of the target at the time of the fixed frame.
         found: the target in the zoom image, if it was found. It belongs to this zoom frame, or to an earlier one whose
             time it has, if the fixed camera is later.
+        expected: the target as it should appear in the zoom frame, at that frame's time; None if that is not known.
         head_commands: commands sent to the head since the run began.
         lens_commands: commands sent to the lens since the run began.
         skipped: frames of the fixed camera that were not worked on since the previous step, by its rate.
@@ -333,6 +334,7 @@ class Step:
     lens: ZoomState
     estimate: Estimate | None = None
     found: ZoomMeasurement | None = None
+    expected: Appearance | None = None
     head_commands: int = 0
     lens_commands: int = 0
     skipped: int = 0
@@ -696,6 +698,7 @@ class Run:
             lens=head.lens,
             estimate=estimate,
             found=found,
+            expected=None if target is None else head.search.expect(zoom.t),
             head_commands=head.controller.head_commands,
             lens_commands=head.controller.lens_commands,
             skipped=self._skipped(),

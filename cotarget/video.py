@@ -237,6 +237,11 @@ class FilmWriter(contextlib.AbstractContextManager["FilmWriter", None]):
             with self._part.ending(keep=False):
                 raise self._said(error) from None
 
+    @property
+    def size_bytes(self) -> int:
+        """Size of what is written so far [bytes]; the encoder keeps some frames back."""
+        return self._part.path.stat().st_size
+
     def write(self, image: Image, t: float) -> None:
         """Append an image.
 

@@ -5,6 +5,7 @@ import dataclasses
 import math
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 from cotarget.cli.common import add_file, check_outputs, print_json, rig_files, scores_of
@@ -33,12 +34,15 @@ def add(parser: argparse.ArgumentParser) -> None:
     about = "score the tracks by these labels: a csv as for detect, whose frame is the image number in DIR/fixed"
     add_file(parser, "--labels", about)
     add_outputs(parser)
+    about = "write one page with both films, tracks, states and plots, which a browser opens from disk (.html)"
+    add_file(parser, "--html", about)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the pipeline on a recording and compare its commands; return the exit status."""
     from cotarget.backends import open_recording
     from cotarget.calibration import Calibration
+    from cotarget.page.run_file import RunFile
     from cotarget.recording.replay import Replay
     from cotarget.safety.safe_rig import guard
     from cotarget.track_metrics import read_labels
@@ -48,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"{options.recording}: {note}", file=sys.stderr)
     calibration = Calibration.load(recording.calibration)
     config, name, rate_hz = recording.config, recording.target, recording.spec.fixed.rate_hz
-    check_outputs(output_files(options), [*rig_files(None, config), options.recording, options.labels])
+    check_outputs([*output_files(options), options.html], [*rig_files(None, config), options.recording, options.labels])
     labels = None if options.labels is None else read_labels(options.labels)
     played, seen = Replay(recording), TracksByImage(recording.pictures)
     selection = Selection(options, recording.spec.fixed.size, recording.selector_table)
@@ -62,7 +66,8 @@ def run(options: argparse.Namespace) -> int:
     run = RunInputs(opened, config, calibration, name, rate_hz, selection, math.inf, recording.steps, played)
     if recording.orders:
         run = dataclasses.replace(run, operated=operated)
-    result = run_observed(run, options, seen)
+    with RunFile(options.html, recording) if options.html else nullcontext() as page:
+        result = run_observed(run, options, seen, *([] if page is None else [page]))
     if result.interrupt is not None:
         raise result.interrupt
     warn_if_unseen("replay", run, result.counts)

@@ -1,7 +1,8 @@
 """Define what page and server say to each other.
 
 A browser sends small JSON objects, whose models are here; anything else costs it its socket. The server sends text, a
-`Status` every 100 ms or a sentence, and pictures: the length of a JSON table, the table, and a JPEG a camera.
+`Status` every 100 ms or a sentence, and pictures: the length of a JSON table, the table, and a JPEG a camera. The page
+of a recorded run has the same table for each of its steps.
 """
 
 import json
@@ -16,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from cotarget.errors import CotargetError
 from cotarget.estimation.motion_model import GATE
 from cotarget.pipeline import HEAD, Step
-from cotarget.rig import Image, RigSpec
+from cotarget.rig import Frame, Image, RigSpec
 
 MAX_BYTES = 4096  # of a message of a browser
 LONGEST_NAME = 64  # characters
@@ -129,15 +130,26 @@ def pack(step: Step, n: int, spec: RigSpec, skipped: int, made: float) -> bytes:
         skipped: frames of the fixed camera that were not worked on since the run began.
         made: when the step was done, by the clock on the wall [s since 1970].
     """
-    frames = {"fixed": step.fixed, "zoom": step.zoom}
-    jpegs = [_jpeg(frame.image) for frame in frames.values()]
-    table = {
-        "n": n,
+    jpegs = [_jpeg(image) for image in pictures(step).values()]
+    table = describe(step, spec, skipped) | {"n": n, "made": made}
+    for camera, jpeg in zip(table["cameras"].values(), jpegs, strict=True):
+        camera["bytes"] = len(jpeg)
+    head = json.dumps(table, allow_nan=False).encode()
+    return b"".join([struct.pack(">I", len(head)), head, *jpegs])
+
+
+def pictures(step: Step) -> dict[str, Image]:
+    """Return both cameras' images by name, at most `WIDEST_PX` wide."""
+    return {name: _narrowed(frame.image) for name, frame in _frames(step).items()}
+
+
+def describe(step: Step, spec: RigSpec, skipped: int) -> dict[str, Any]:
+    """Describe a step as the page's drawing wants it; arguments as for `pack`."""
+    return {
         "t": step.t,
-        "made": made,
         "cameras": {
-            name: {"size": list(frame.image.shape[1::-1]), "age_s": step.t - frame.t, "bytes": len(jpeg)}
-            for (name, frame), jpeg in zip(frames.items(), jpegs, strict=True)
+            name: {"size": list(frame.image.shape[1::-1]), "age_s": step.t - frame.t}
+            for name, frame in _frames(step).items()
         },
         "tracks": [
             [track.id, *_rounded(track.center_px), *_rounded(track.size_px)] for track in step.tracks if track.reported
@@ -146,13 +158,15 @@ def pack(step: Step, n: int, spec: RigSpec, skipped: int, made: float) -> bytes:
         "steps": step.index + 1,
         "skipped": skipped,
     }
-    head = json.dumps(table, allow_nan=False).encode()
-    return b"".join([struct.pack(">I", len(head)), head, *jpegs])
+
+
+def _frames(step: Step) -> dict[str, Frame]:
+    return {"fixed": step.fixed, "zoom": step.zoom}
 
 
 def _head(step: Step, spec: RigSpec) -> dict[str, Any]:
-    """Describe a head: state, aim, limits, and where its camera will look for the target."""
-    limits = spec.head.limits
+    """Describe a head: state, aim, limits, and where its camera should show the target."""
+    limits, (pan, tilt, focal_px) = spec.head.limits, step.commanded
     return {
         "camera": "zoom",
         "state": step.state,
@@ -163,29 +177,30 @@ def _head(step: Step, spec: RigSpec) -> dict[str, Any]:
         "moving": step.head.moving,
         "pan_range_deg": _degrees(limits.pan.range),
         "tilt_range_deg": _degrees(limits.tilt.range),
+        "commanded": [math.degrees(pan), math.degrees(tilt), focal_px],
         "focal_px": step.lens.focal_px,
         "focal_range_px": list(spec.zoom.focal_range),
         "range_m": None if step.aim is None else step.aim.range,
         "predicted": _predicted(step),
+        "found": None if step.found is None or step.found.t != step.zoom.t else _rounded(step.found.center_px),
     }
 
 
 def _predicted(step: Step) -> dict[str, Any] | None:
-    """Predict the target in the zoom image: centre, the half axes and turn of the searched ellipse, the error [px]."""
-    seen = (
-        None if step.estimate is None else step.estimate.appearance(step.head.pan, step.head.tilt, step.lens.focal_px)
-    )
+    """Predict the target in the zoom image: centre, half axes and turn of its ellipse, error, size [px]."""
+    seen = step.expected
     if seen is None:
         return None
     variances, axes = np.linalg.eigh(seen.covariance)
     height, width = step.zoom.image.shape[:2]
     center = np.array([width - 1, height - 1]) / 2 + seen.offset_px
-    values = np.array([*center, *np.sqrt(np.maximum(variances[::-1], 0.0))])
+    values = np.array([*center, *np.sqrt(np.maximum(variances[::-1], 0.0)), seen.size_px])
     if not np.isfinite(values).all():
         return None
-    u, v, longer, shorter = values.tolist()
+    u, v, longer, shorter, size_px = values.tolist()
     gate, turn = math.sqrt(GATE), math.atan2(axes[1, 1], axes[0, 1])
-    return {"at": [u, v], "axes": [gate * longer, gate * shorter], "turn": turn, "error_px": longer}
+    half = [gate * longer, gate * shorter]
+    return {"at": [u, v], "axes": half, "turn": turn, "error_px": longer, "size_px": size_px}
 
 
 def _degrees(ends: tuple[float, float]) -> list[float | None]:
@@ -197,10 +212,14 @@ def _rounded(pair: Any) -> list[float]:
     return [round(float(each), 1) for each in pair]
 
 
-def _jpeg(image: Image) -> bytes:
-    """Compress a picture, at most `WIDEST_PX` wide."""
+def _narrowed(image: Image) -> Image:
+    """Make an image smaller that is wider than `WIDEST_PX`."""
     height, width = image.shape[:2]
-    if width > WIDEST_PX:
-        size = WIDEST_PX, max(round(height * WIDEST_PX / width), 1)
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+    if width <= WIDEST_PX:
+        return image
+    size = WIDEST_PX, max(round(height * WIDEST_PX / width), 1)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def _jpeg(image: Image) -> bytes:
     return cv2.imencode(".jpg", image, JPEG)[1].tobytes()

@@ -7,8 +7,6 @@ after it has drawn the last, so that a slow one delays nobody. docs/page.md says
 """
 
 import asyncio
-import base64
-import hashlib
 import hmac
 import http
 import ipaddress
@@ -22,13 +20,13 @@ from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from time import monotonic, time
 from typing import Any
 
 from cotarget.control.orders import MANUAL_S
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.operate.session import Session
+from cotarget.page.html import policy, render
 from cotarget.page.messages import (
     MAX_BYTES,
     BadMessageError,
@@ -50,7 +48,6 @@ from cotarget.rig import RigSpec
 LOOPBACK = "127.0.0.1"
 PORT = 8080
 SOCKET = "/socket"  # path of the page's socket
-PAGE = Path(__file__).with_name("page.html")
 HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9.-]+)(:\d{1,5})?")
 TOKEN_BYTES = 16
 HELLO_S = 2.0  # time for the first message, and for a request
@@ -94,20 +91,6 @@ def listen(host: str, port: int) -> socket.socket:
             f"--page-port {port}: {error.strerror}; give another one, or 0 for any that is free"
         ) from None
     return listener
-
-
-def policy(page: str, host: str) -> str:
-    """Make the Content-Security-Policy of the page: its own script and style by hash, and its own socket."""
-
-    def hashes(tag: str) -> str:
-        texts = re.findall(rf"<{tag}>(.*?)</{tag}>", page, re.DOTALL)
-        digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in texts)
-        return " ".join(f"'sha256-{each}'" for each in digests)
-
-    return (
-        f"default-src 'none'; script-src {hashes('script')}; style-src {hashes('style')}; "
-        f"connect-src ws://{host} wss://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    )
 
 
 @dataclass(eq=False)
@@ -159,7 +142,7 @@ class Page:
         self.token = secrets.token_urlsafe(TOKEN_BYTES)
         name = f"[{host}]" if ":" in host else host
         self.link = f"http://{name}:{listener.getsockname()[1]}/#{self.token}"
-        self._html = PAGE.read_text(encoding="utf-8")
+        self._html = render("page.html")
         self._clients: set[Client] = set()
         self._strangers: OrderedDict[Any, None] = OrderedDict()  # connections without the token, the oldest first
         self._ticks: OrderedDict[int, float] = OrderedDict()
@@ -289,7 +272,9 @@ class Page:
         response.headers.update(
             {
                 "Content-Type": "text/html; charset=utf-8",
-                "Content-Security-Policy": policy(self._html, host),
+                "Content-Security-Policy": (
+                    f"{policy(self._html)}; connect-src ws://{host} wss://{host}; frame-ancestors 'none'"
+                ),
                 "X-Content-Type-Options": "nosniff",
                 "Referrer-Policy": "no-referrer",
                 "Cache-Control": "no-store",

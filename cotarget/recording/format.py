@@ -329,6 +329,7 @@ class Recording:
         ending: "complete", the error that ended the run, or where a truncated log breaks off.
         truncated: whether the log has no end; then the last step, which may be incomplete, is left out.
         notes: remarks for the user, one line each.
+        when: date and time at which it began, as text; empty in one that does not say.
     """
 
     directory: Path
@@ -342,6 +343,7 @@ class Recording:
     truncated: bool
     notes: tuple[str, ...]
     orders: tuple[tuple[int, Order], ...] = ()
+    when: str = ""
 
     @property
     def steps(self) -> int:
@@ -416,6 +418,7 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
         truncated,
         tuple(notes),
         tuple(orders),
+        str(meta.get("when", "")),
     )
 
 

@@ -74,7 +74,11 @@ REFUSED = [
     *(((*FOLLOW, option), name) for option in ("--csv", "--video") for name in INPUTS if name not in DETECT),
     *(((*FOLLOW, "--record", "new", option), "new") for option in ("--csv", "--video")),
     *(((*REPLAYED, option), name) for option in ("--csv", "--video", "--record") for name in RECORDING),
-    *((("replay", "run", option), name) for option in ("--csv", "--video") for name in (*RECORDING, "way/log.jsonl")),
+    *(
+        (("replay", "run", option), name)
+        for option in ("--csv", "--video", "--html")
+        for name in (*RECORDING, "way/log.jsonl")
+    ),
     (("replay", "run", "--labels", "labels.csv", "--csv"), "labels.csv"),
     *((DETECT, name) for name in INPUTS if name != "rig_calibration.json"),
     *(((*DETECT, "new.csv", "--video"), name) for name in INPUTS if name != "rig_calibration.json"),

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cotarget.page.server import PAGE
+from cotarget.page.html import render
 from cotarget.pipeline import State
-from tests.support.chromium import Browser, find, until
+from experiments.wire.chromium import Browser, find, until
 from tests.support.page_client import SPEC, served, step
 
 pytestmark = [
@@ -277,7 +277,7 @@ def test_it_fits_and_does_not_jump(browser, at, width, tmp_path):
 
 def colours(dark):
     """The style's colours by name."""
-    style = PAGE.read_text().partition("<style>")[2].partition("</style>")[0]
+    style = render("page.html").partition("<style>")[2].partition("</style>")[0]
     light, _, rest = style.partition("@media (prefers-color-scheme: dark)")
     found = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", light))
     return found | (dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", rest)) if dark else {})
@@ -308,11 +308,11 @@ def test_colours_have_enough_contrast(dark):
 
 def test_nothing_moves_on_the_page_by_itself():
     """Reduced motion needs no case of its own."""
-    assert not re.search(r"animation|transition|@keyframes|scroll-behavior", PAGE.read_text())
+    assert not re.search(r"animation|transition|@keyframes|scroll-behavior", render("page.html") + render("run.html"))
 
 
 def test_states_have_words():
-    page = PAGE.read_text()
+    page = render("page.html")
     words = page.partition("const WORDS = {")[2].partition("};")[0]
     for state in State:
         assert re.search(rf'(\b{state}|"{state}"): "', words), state

@@ -58,9 +58,11 @@ def test_a_picture_says_what_is_shown():
         SimpleNamespace(id=8, center_px=np.array([10.0, 5.0]), size_px=np.array([9.0, 8.0]), reported=False),
     )
     covariance = np.array([[25.0, 0.0], [0.0, 4.0]])
-    seen = SimpleNamespace(covariance=covariance, offset_px=np.array([10.0, -5.0]))
-    estimate = SimpleNamespace(appearance=lambda *pose: seen)
-    shown = step(3, tracks=tracks, target=tracks[0], estimate=estimate, state=State.FOLLOWING, reason="<b>why</b>")
+    seen = SimpleNamespace(covariance=covariance, offset_px=np.array([10.0, -5.0]), size_px=80.0)
+    found = SimpleNamespace(center_px=np.array([330.04, 235.0]), t=3 / 25)
+    shown = step(
+        3, tracks=tracks, target=tracks[0], expected=seen, found=found, state=State.FOLLOWING, reason="<b>why</b>"
+    )
     data = pack(shown, 3, SPEC, 5, 1.5)
     size = int.from_bytes(data[:4], "big")
     table = json.loads(data[4 : 4 + size])
@@ -70,6 +72,9 @@ def test_a_picture_says_what_is_shown():
     assert head["predicted"]["at"] == [329.5, 234.5]
     assert head["predicted"]["axes"] == pytest.approx([15.0, 6.0])  # three standard deviations
     assert head["predicted"]["error_px"] == pytest.approx(5.0)
+    assert head["predicted"]["size_px"] == 80.0
+    assert head["found"] == [330.0, 235.0]
+    assert head["commanded"] == [0.0, 0.0, 700.0]
     assert math.sin(head["predicted"]["turn"]) == pytest.approx(0.0)
     assert head["pan_deg"] == pytest.approx(math.degrees(0.1))
     assert table["cameras"]["fixed"]["age_s"] == pytest.approx(0.06)

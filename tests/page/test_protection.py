@@ -15,7 +15,8 @@ from websockets.sync.client import connect
 
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.page import server
-from cotarget.page.server import LOOPBACK, MOST_STRANGERS, PAGE, listen
+from cotarget.page.html import render
+from cotarget.page.server import LOOPBACK, MOST_STRANGERS, listen
 from tests.support.page_client import (
     DEADLINE_S,
     SPEC,
@@ -120,7 +121,7 @@ def test_the_token_is_in_no_log(at, caplog):
         closed(other)
     ours = [record for record in caplog.records if record.name.startswith("cotarget")]
     assert not any(at.page.token in record.getMessage() for record in ours)
-    assert at.page.token not in PAGE.read_text()
+    assert at.page.token not in render("page.html")
 
 
 # Host and Origin
@@ -186,8 +187,9 @@ def test_the_page_may_load_nothing_but_itself(at):
     assert headers["Content-Type"] == "text/html; charset=utf-8"
 
 
-def test_the_page_is_small_and_writes_no_markup():
-    text = PAGE.read_text()
+@pytest.mark.parametrize("name", ["page.html", "run.html"])
+def test_a_page_is_small_and_writes_no_markup(name):
+    text = render(name)
     assert len(text.encode()) <= 60_000
     assert len(text.splitlines()) <= 1200
     assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|new Function", text)
