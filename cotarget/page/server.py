@@ -267,14 +267,14 @@ class Page:
             return None
         if request.path != "/":
             return connection.respond(http.HTTPStatus.NOT_FOUND, "There is only one page: /\n")
+        # A policy has no addresses of IPv6; 'self' is the page's own socket too, but not in every browser.
+        own = "'self'" if host.startswith("[") else f"ws://{host} wss://{host}"
         response = connection.respond(http.HTTPStatus.OK, self._html)
         del response.headers["Content-Type"]
         response.headers.update(
             {
                 "Content-Type": "text/html; charset=utf-8",
-                "Content-Security-Policy": (
-                    f"{policy(self._html)}; connect-src ws://{host} wss://{host}; frame-ancestors 'none'"
-                ),
+                "Content-Security-Policy": f"{policy(self._html)}; connect-src {own}; frame-ancestors 'none'",
                 "X-Content-Type-Options": "nosniff",
                 "Referrer-Policy": "no-referrer",
                 "Cache-Control": "no-store",

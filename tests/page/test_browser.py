@@ -8,10 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cotarget.errors import DeviceError
 from cotarget.page.html import render
+from cotarget.page.server import Page, listen
 from cotarget.pipeline import State
 from experiments.wire.chromium import Browser, find, until
-from tests.support.page_client import SPEC, served, step
+from tests.support.page_client import SPEC, NotingSession, served, step
 
 pytestmark = [
     pytest.mark.browser,
@@ -243,6 +245,17 @@ def test_without_a_connection_it_says_in_large_letters_that_it_cannot_stop(brows
     until(lambda: "cannot stop" in browser.text("offline-text"))
     assert browser.js("parseFloat(getComputedStyle(document.getElementById('offline')).fontSize)") >= 28
     assert browser.js("getComputedStyle(document.getElementById('offline')).display") == "block"
+
+
+def test_it_connects_at_an_address_of_ipv6(browser):
+    try:
+        listener = listen("::1", 0)
+    except DeviceError:
+        pytest.skip("this machine has no IPv6")
+    with Page(NotingSession(), listener, "::1") as page:
+        browser.open(page.link)
+        until(lambda: browser.text("control") == "You have control.")
+        browser.open("about:blank")
 
 
 def test_an_old_link_and_none_say_so(browser, at):
