@@ -63,17 +63,18 @@ class RealTimeSettings(Settings):
     in_file: Count = 75
 
 
-def serve(pipe: Connection, frames: int, sent: Any) -> None:
-    """Send the film and emulate the head.
+def serve(pipe: Connection, frames: int, sent: Any, size: tuple[int, int] = STREAM) -> None:
+    """Send the film, as both cameras of the server, and emulate the head.
 
     Args:
         pipe: to the other process; gets the addresses of camera and head.
         frames: number of frames to send.
         sent: gets the time at which each frame from 1 on was published [s], infinite before; the first value is set
             when to begin.
+        size: width and height of its frames [px].
     """
     sys.setswitchinterval(5e-4)  # as in `cotarget emulate`
-    images = [frame.image for frame, _ in film(STREAM, LENGTH, 0)]
+    images = [frame.image for frame, _ in film(size, LENGTH, 0)]
     encoded: dict[int, bytes] = {}
 
     def once(image: Image, quality: int, size: tuple[int, int] | None = None) -> bytes:
@@ -86,7 +87,7 @@ def serve(pipe: Connection, frames: int, sent: Any) -> None:
     try:
         with (
             mock.patch.object(axis_241q, "encode_jpeg", once),
-            axis_241q.AxisServer({1: feed}, quality=QUALITY) as server,
+            axis_241q.AxisServer({1: feed, 2: feed}, quality=QUALITY) as server,
         ):
             for image in images:
                 once(image, QUALITY)
