@@ -75,6 +75,7 @@ class Session:
         self._lock = threading.Lock()
         self._orders: list[Order] = [Order("stand", HEAD)]
         self._turning: dict[str, tuple[tuple[float, float], float]] = {}  # rates by head, and when they end
+        self._zooms: list[tuple[Order, float]] = []  # orders to zoom, and when they end
         self._to_clear = False
         self.stopped: str | None = None
         self.notice = ""
@@ -133,7 +134,7 @@ class Session:
             self._turning[head] = rates, self._now() + MANUAL_S
 
     def zoom(self, head: str, factor: float, *, by: str | None = None) -> None:
-        """Multiply the focal length of a head that does not follow.
+        """Multiply the focal length of a head that does not follow, with a frame within `MANUAL_S`.
 
         Raises:
             ConfigError: it follows.
@@ -154,7 +155,7 @@ class Session:
         """
         with self._lock:
             self.stopped, self._to_clear = reason, False
-            self._orders, self._turning = [Order("stop", reason=reason)], {}
+            self._orders, self._turning, self._zooms = [Order("stop", reason=reason)], {}, []
         if self._rig.spec.real_time:  # a simulation's devices are the run's thread's alone
             self._rig.stop(reason)
         if self._stop_file is not None:
@@ -164,7 +165,7 @@ class Session:
         """End the stop before the next frame; all heads stand then."""
         self._refuse_other(by)
         with self._lock:
-            self._to_clear, self._orders, self._turning = True, [], {}
+            self._to_clear, self._orders, self._turning, self._zooms = True, [], {}, []
 
     @property
     def recording(self) -> str:
@@ -211,7 +212,7 @@ class Session:
     def _let_stand(self, *modes: Mode) -> None:
         """Let the heads stand, of these modes only if any are given; with the lock held."""
         if not modes or self._run.head.mode in modes or self._turning:
-            self._turning = {}
+            self._turning, self._zooms = {}, []
             self._orders = [*(each for each in self._orders if each.kind == "stop"), Order("stand", HEAD)]
 
     def _give(self, order: Order, by: str | None) -> None:
@@ -222,10 +223,12 @@ class Session:
             if self.stopped is not None and order.kind != "stand":
                 raise ConfigError("stopped: nothing moves before Clear")
             self._idle_since = None
-            if order.kind != "zoom":
-                self._turning.pop(order.of, None)
-                self._orders = [each for each in self._orders if each.kind in ("stop", "zoom")]
-            self._orders.append(order)
+            if order.kind == "zoom":
+                self._zooms.append((order, self._now() + MANUAL_S))
+                return
+            self._turning.pop(order.of, None)
+            self._zooms = []
+            self._orders = [*(each for each in self._orders if each.kind == "stop"), order]
 
     def _refuse_other(self, by: str | None) -> None:
         if by is not None and by != self.control:
@@ -292,7 +295,7 @@ class Session:
                 orders, self.stopped = [Order("stop", reason=there)], there
             self._to_clear = False
             if self.stopped is not None:
-                self._turning = {}
+                self._turning, self._zooms = {}, []
             orders += self._by_hand()
         if self._records is not None:
             for order in orders:
@@ -300,8 +303,9 @@ class Session:
         return orders
 
     def _by_hand(self) -> list[Order]:
-        """Orders by hand that hold now, and for each that has ended one to stand."""
-        orders = []
+        """Orders by hand that hold now, and for each turn that has ended one to stand."""
+        orders = [order for order, until in self._zooms if self._now() < until]
+        self._zooms = []
         for head, (rates, until) in list(self._turning.items()):
             if self._now() < until:
                 orders.append(Order("manual", head, rates=rates))

@@ -135,6 +135,16 @@ def test_home_and_zoom(path):
     assert steps[-1].reason == "is at home"
 
 
+def test_a_zoom_that_had_to_wait_moves_nothing(path):
+    def act(i, session, wall, rig):
+        if i in (20, 40):
+            session.zoom("head", 2.0)
+            wall.t += 0.25 if i == 20 else 0.35  # until the next frame
+
+    steps = operate(path, FRAMES, act)
+    assert [steps[i].commanded[2] for i in (20, 21, 40, 41)] == [FOCALS[0], 2 * FOCALS[0], 2 * FOCALS[0], 2 * FOCALS[0]]
+
+
 def test_the_lens_of_a_head_that_follows_is_not_zoomed_by_hand(path):
     def act(i, session, wall, rig):
         if i == 0:
