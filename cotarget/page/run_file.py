@@ -22,7 +22,8 @@ from cotarget.recording.format import Recording
 from cotarget.rig import Image
 from cotarget.video import FilmWriter
 
-MOST_BYTES = 100_000_000  # of a page; a browser takes some seconds to open it, and several times as much memory
+# Size of a page from which it is cut; a browser takes some seconds to open it, and several times as much memory.
+MOST_BYTES = 100_000_000
 DECIMALS = 4  # of the numbers in the page
 CHUNK = 3 << 20  # bytes that are coded at once, a multiple of 3
 END = "</body>"
@@ -49,7 +50,8 @@ class RunFile(contextlib.AbstractContextManager["RunFile", None]):
         self._film_path = Path(self._folder.name) / "film.mp4"
         self._film = FilmWriter(self._film_path, recording.spec.fixed.rate_hz)
         self._steps: list[str] = []
-        self._size = self._skipped = 0
+        self._page, self._skipped = render("run.html"), 0
+        self._size = len(self._page)
         self._places: dict[str, list[int]] = {}
         self._begin = 0.0
         self._cut_s: float | None = None
@@ -81,7 +83,7 @@ class RunFile(contextlib.AbstractContextManager["RunFile", None]):
 
     @property
     def _cut(self) -> str:
-        return f"holds the first {self._cut_s:.1f} s of the run, because a page has {MOST_BYTES // 10**6} MB at most"
+        return f"holds the first {self._cut_s:.1f} s of the run, because a page holds some {MOST_BYTES // 10**6} MB"
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Complete the page and give it its name.
@@ -98,9 +100,8 @@ class RunFile(contextlib.AbstractContextManager["RunFile", None]):
 
     def _write(self, file: io.RawIOBase) -> None:
         """Write the page, then the run as data at its end."""
-        page = render("run.html")
-        meta = f'<head>\n<meta http-equiv="Content-Security-Policy" content="{policy(page)}; media-src blob:">'
-        head, _, tail = page.replace("<head>", meta, 1).rpartition(END)
+        meta = f'<head>\n<meta http-equiv="Content-Security-Policy" content="{policy(self._page)}; media-src blob:">'
+        head, _, tail = self._page.replace("<head>", meta, 1).rpartition(END)
         recording = self._recording
         notes = [*recording.notes, *([] if self._cut_s is None else [f"the page {self._cut}"])]
         run = {
