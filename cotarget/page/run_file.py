@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cotarget.files import PartFile, write_all
+from cotarget.files import PartFile, write_all, write_error
 from cotarget.page.html import policy, render
 from cotarget.page.messages import describe, pictures
 from cotarget.pipeline import Step
@@ -46,7 +46,11 @@ class RunFile(contextlib.AbstractContextManager["RunFile", None]):
             CotargetError: the folder cannot be written to.
         """
         self._path, self._recording = path, recording
-        self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.", ignore_cleanup_errors=True)
+        beside, hidden = path.parent, f".{path.stem}."
+        try:
+            self._folder = tempfile.TemporaryDirectory(dir=beside, prefix=hidden, ignore_cleanup_errors=True)
+        except OSError as error:
+            raise write_error(path, error) from None
         self._film_path = Path(self._folder.name) / "film.mp4"
         self._film = FilmWriter(self._film_path, recording.spec.fixed.rate_hz)
         self._steps: list[str] = []
