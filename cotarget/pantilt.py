@@ -16,6 +16,7 @@ The inverse is written by coordinates, in floats, because an array of one target
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
@@ -205,6 +206,45 @@ def solve(
             pan, tilt = head.reported_angles(*((angle + math.pi) % TURN - math.pi for angle in angles))
             ways.append((pan, tilt, reach) if reach > 0 else NOWHERE)
     return Pointing(*np.moveaxis(np.reshape(ways, (*x_base.shape[:-1], 2, 3)), -1, 0))
+
+
+def closed_form(
+    x_base: Sequence[Array], d: Array, t: Array, head: HeadGeometry = IDEAL_HEAD, rounds: int = 2
+) -> tuple[Array, Array, Array]:
+    """Solve reported pan, tilt and range of many targets in the branch that faces forward (Eqs. 13, 14 and 16).
+
+    This is `solve` without Newton's method, in arrays: for dz != 0 each round shrinks the error by dz over the range,
+    so that two rounds leave less than 1e-6 rad from a metre on. It takes one target's time for some fifty.
+
+    Args:
+        x_base: targets in the base's frame [m], (3, ...).
+        d: unit vector of the ray on which each target shall lie, in the head's frame, (3, ...).
+        t: zoom camera's position in the head's frame [m], (3, ...).
+        head: geometry of the head.
+        rounds: rounds for dz != 0.
+
+    Returns:
+        Pan and tilt [rad] and range [m], (...) each; nan for a target nearer than the lever arm.
+    """
+    (a, b, c), (dx, dy, dz_ray), (tx, ty, tz) = x_base, d, t
+    dz, cos_eps, sin_eps = head.axis_offset, math.cos(head.squareness), math.sin(head.squareness)
+    tz = tz - dz
+    along = dx * tx + dy * ty + dz_ray * tz
+    free = along * along + a * a + b * b + c * c - dz * dz - (tx * tx + ty * ty + tz * tz)
+    ahead: Array | float = 0.0
+    with np.errstate(invalid="ignore"):
+        for _ in range(1 if dz == 0 else rounds):
+            reach = np.sqrt(free - 2 * dz * ahead) - along
+            qx, qy, qz = reach * dx + tx, reach * dy + ty, reach * dz_ray + tz
+            on_axis = cos_eps * qx + sin_eps * qy
+            y, z, height = qy - on_axis * sin_eps, cos_eps * qz, b - on_axis * sin_eps
+            tilt = np.arctan2(y, z) - np.arctan2(height, np.sqrt(np.maximum(y * y + z * z - height * height, 0.0)))
+            cos, sin = np.cos(tilt), np.sin(tilt)  # rotate q about the tilt axis (Rodrigues)
+            x = cos * qx + sin * sin_eps * qz + (1 - cos) * on_axis * cos_eps
+            ahead = cos * qz + sin * (cos_eps * qy - sin_eps * qx)
+        z2 = ahead + dz
+        pan = np.arctan2(a * z2 - c * x, a * x + c * z2)
+        return *head.reported_angles(pan, tilt), reach
 
 
 def nearest(

@@ -248,8 +248,8 @@ def rig_numbers(
 Picture = npt.NDArray[np.uint8]
 Observation = TypeVar("Observation")
 Action = TypeVar("Action")
-Kind = Literal["tracks", "images"]
-KINDS: tuple[Kind, ...] = ("tracks", "images")
+Kind = Literal["tracks", "images", "both"]
+KINDS: tuple[Kind, ...] = ("tracks", "images")  # of the environments of version 0
 IMAGE_SIZE: Size = (64, 64)
 DETECTOR_NOISE = TruthNoise()
 RENDER_SIZE: Size = (320, 240)  # of each of the two pictures that `render` puts side by side [px]
@@ -298,6 +298,7 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012  as gymnasium has it
+    _kinds: Sequence[Kind] = KINDS
 
     def __init__(
         self,
@@ -314,7 +315,7 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         Raises:
             ConfigError: an argument is invalid.
         """
-        one_of("observation", observation, KINDS)
+        one_of("observation", observation, self._kinds)
         if render_mode is not None:
             one_of("render_mode", render_mode, self.metadata["render_modes"])
         if isinstance(calibration, Path | str):
@@ -360,7 +361,8 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
 
     def profile_of(self, name: str) -> TargetProfile:
         """Target profile for the pipeline; its detector is the default one, as all detections come from the truth."""
-        return replace(self.config.target(name), detector=DEFAULT_TARGETS[name].detector)
+        detector = DEFAULT_TARGETS[name].detector if name in DEFAULT_TARGETS else TargetProfile.detector
+        return replace(self.config.target(name), detector=detector)
 
     def render(self) -> Picture | None:
         """Render both cameras side by side, RGB, if the render mode is "rgb_array"."""
@@ -390,10 +392,14 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         """Open an episode with targets on given paths, reusing the renderers of the previous one."""
         self._end()
         sim = replace(self.config.sim, seed=seed, targets=tuple(paths), paths=paths)
-        self._episode = Episode(replace(self.config, sim=sim), self._noise)
+        self._episode = self._made(replace(self.config, sim=sim))
         for size, before in self._opened.items():
             self._opened[size] = self._episode.world.pictures(size, before)
         return self._episode
+
+    def _made(self, config: RigConfig) -> Episode:
+        """Make the episode of a rig with its targets."""
+        return Episode(config, self._noise)
 
     def _end(self) -> None:
         """Close the episode, if there is one."""

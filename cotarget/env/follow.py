@@ -1,6 +1,7 @@
 """`cotarget/Follow-v0`: hold a target in the close-up, by commands of pan, tilt and focal length."""
 
 import math
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +9,13 @@ import gymnasium
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig
+from cotarget.config import RigConfig, Waypoint
 from cotarget.env.common import (
     DETECTOR_NOISE,
     IMAGE_SIZE,
     LONGEST_AGE_S,
     RIG_FEATURES,
+    Command,
     Kind,
     RigEnv,
     Vector,
@@ -25,6 +27,7 @@ from cotarget.env.common import (
 )
 from cotarget.evaluation import TruthNoise, closeup_of
 from cotarget.metrics import Closeup
+from cotarget.rig import Frame, Rig
 from cotarget.schema import Size
 from cotarget.sim.targets.random_paths import LONE, SECONDS, lone_path
 from cotarget.tracking.track import tracking_settings
@@ -69,6 +72,9 @@ class Follow(RigEnv[Any, Vector]):
     camera, in its own axes, a unit vector. Behind a camera, positions are infinite and the size ratio is 0.
     """
 
+    wide: Frame  # newest frame of the fixed camera
+    closeup: Frame  # newest frame of the zoom camera
+
     def __init__(
         self,
         target: str = "bird",
@@ -98,18 +104,29 @@ class Follow(RigEnv[Any, Vector]):
         Raises:
             ConfigError: an argument is invalid.
         """
-        self.name = one_of("target", target, LONE)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
-        check_scene(self.config.sim, target, lone_path)
+        self.name = one_of("target", target, self._targets())
+        if target in LONE and target not in self._own_paths():
+            check_scene(self.config.sim, target, lone_path)
         self.target = self.profile_of(target)
         self._rig_space = box(RIG_FEATURES.values())
         self._track_space = box([*TRACK_FEATURES.values(), *RIG_FEATURES.values()])
         self.action_space = box([(-1.0, 1.0)] * 3)  # type: ignore[assignment]
-        self.observation_space = (
-            self._track_space
-            if observation == "tracks"
-            else gymnasium.spaces.Dict({**self._picture_spaces(), "rig": self._rig_space})
-        )
+        self.observation_space = self._space()
+
+    def _space(self) -> gymnasium.Space[Any]:
+        """Space of the observations."""
+        if self._observation == "tracks":
+            return self._track_space
+        return gymnasium.spaces.Dict({**self._picture_spaces(), "rig": self._rig_space})
+
+    def _own_paths(self) -> Mapping[str, tuple[Waypoint, ...]]:
+        """Paths of the rig's configuration that count."""
+        return {}
+
+    def _targets(self) -> Collection[str]:
+        """Names of the targets that can be followed."""
+        return LONE
 
     @property
     def times(self) -> tuple[float, float]:
@@ -119,27 +136,44 @@ class Follow(RigEnv[Any, Vector]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode: a new one each time, the same one after the same seed."""
         seed = self._begin(seed, options)
-        rig = self._open(lone_path(self.name, seed), seed).rig
-        self._tracker = Tracker(tracking_settings(self.target), rig.fixed.size)
-        self._index = 0
-        state = rig.head.state()
-        self._commanded = state.pan, state.tilt, rig.zoom.state().focal_px
-        self.wide, self.closeup = rig.fixed.read(), rig.zoom.read()
+        self._start(self._open(self._path(seed), seed).rig)
         self._detect()
-        return self._observe(), self._info(self._judge())
+        judged = self._judge()
+        return self._observe(), self._info(judged)
 
     def step(self, action: Vector) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Command head and lens, and wait for the next frame of the fixed camera."""
         rig = self.episode.rig
-        pan, tilt, focal_px = self.units.command(action)
-        self._commanded = *rig.head.move(pan, tilt), rig.zoom.zoom(focal_px)
+        self._commanded = self._command(action)
         before = self.closeup.t
         self.wide, self.closeup = rig.fixed.read(newer_than=self.wide.t), rig.zoom.read()
         self._index += 1
         self._detect()
         judged = self._judge()
-        reward = float(judged.good and self.closeup.t > before)
+        reward = self._reward(judged, self.closeup.t > before)
         return self._observe(), reward, False, self._index >= self._last, self._info(judged)
+
+    def _start(self, rig: Rig) -> None:
+        """Start tracking and read the first frames of an episode's rig."""
+        self._tracker = Tracker(tracking_settings(self.target), rig.fixed.size)
+        self._index = 0
+        state = rig.head.state()
+        self._commanded = state.pan, state.tilt, rig.zoom.state().focal_px
+        self.wide = rig.fixed.read()
+        self.closeup = rig.zoom.read()
+
+    def _path(self, seed: int) -> Mapping[str, tuple[Waypoint, ...]]:
+        """Draw the target's path, by its name."""
+        return lone_path(self.name, seed)
+
+    def _command(self, action: Vector) -> Command:
+        """Command head and lens; return what was commanded after rounding to steps."""
+        rig, (pan, tilt, focal_px) = self.episode.rig, self.units.command(action)
+        return *rig.head.move(pan, tilt), rig.zoom.zoom(focal_px)
+
+    def _reward(self, judged: Closeup, is_new: bool) -> float:
+        """Reward of a step by the newest zoom frame, which may be that of the step before."""
+        return float(judged.good and is_new)
 
     def _detect(self) -> None:
         """Detect and track in the newest frame of the fixed camera."""
@@ -158,7 +192,7 @@ class Follow(RigEnv[Any, Vector]):
         numbers = rig_numbers(
             self.units, rig.head.state(), rig.zoom.state(), self._commanded, ages, self._index / self._last
         )
-        if self._observation == "images":
+        if self._observation != "tracks":
             return {**self._pictures(), "rig": within(numbers, self._rig_space)}
         return within([*self._track_numbers(), *numbers], self._track_space)
 

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import cv2
@@ -24,7 +25,7 @@ from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.sim.model import BOARD_GROUP, RIG, compiled, mount_pose, scene_spec
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.render.optics import TrueLens, fold
-from cotarget.sim.targets.models import kind_model
+from cotarget.sim.targets.models import kind_model, own_model
 from cotarget.sim.targets.target import Target, kind_of
 
 CameraName = Literal["fixed", "zoom"]
@@ -423,7 +424,9 @@ class Outlines:
         mujoco.mj_kinematics(self._model, self._data)
         data = self._data  # reading an array attribute takes as long as the computation with it
         self._qpos, self._places, self._turns = data.qpos, data.xpos, data.xmat.reshape(-1, 3, 3)
-        self._points = {name: outermost(each.kind.name) * each.size for name, each in self.targets.items()}
+        self._points = {
+            name: outermost(each.kind.name, each.kind.own) * each.size for name, each in self.targets.items()
+        }
         self._beats = {name: np.concatenate(points[::EVERY], axis=1) for name, points in self._points.items()}
         self._reach = {name: float(np.linalg.norm(points, axis=1).max()) for name, points in self._points.items()}
         self._axes = [int(self._model.joint(RIG + axis).qposadr[0]) for axis in ("pan", "tilt")]
@@ -558,18 +561,20 @@ def _ends(values: Array) -> tuple[Array, Array]:
 
 
 @lru_cache
-def outermost(kind: str) -> Array:
+def outermost(kind: str, own: Path | None = None) -> Array:
     """Compute a target's outermost points at each phase of its limb cycle, with the body's centre as the last point.
 
     Args:
         kind: name of the target's kind.
+        own: file of a user's own model, which is rigid.
 
     Returns:
         Points in the body's frame, at the model's own size [m], (PHASES, 3, n).
     """
-    model = kind_model(kind).compile()
+    model = (kind_model(kind) if own is None else own_model(own, kind, BOARD_GROUP)).compile()
     data, body = mujoco.MjData(model), model.body(kind).id
-    surfaces, limbs = [surface_points(model, geom) for geom in range(model.ngeom)], kind_of(kind).limbs
+    surfaces = [surface_points(model, geom) for geom in range(model.ngeom)]
+    limbs: Callable[[float], Mapping[str, float]] = kind_of(kind).limbs if own is None else lambda beat: {}
     directions = sphere_points(DIRECTIONS)
     found = []
     for beat in np.arange(PHASES) * 2 * math.pi / PHASES:

@@ -23,6 +23,7 @@ import experiments
 from cotarget.backends import load_config
 from cotarget.cli.main import main
 from cotarget.config import config_table, parse_config
+from cotarget.control.policy import TASK_FEATURES
 from cotarget.drivers import DRIVERS
 from cotarget.drivers.board import BoardSettings, make_board
 from cotarget.drivers.rig import board_settings, devices
@@ -357,7 +358,7 @@ def test_board_presenter_gets_the_listed_requests():
 
 
 # --- environments ---
-FOLLOW, SCHEDULE = "cotarget/Follow-v0", "cotarget/Schedule-v0"
+FOLLOW, FOLLOW_V1, SCHEDULE = "cotarget/Follow-v0", "cotarget/Follow-v1", "cotarget/Schedule-v0"
 
 
 def span(space, where, names=None):
@@ -395,11 +396,12 @@ def default_of(parameter):
 
 FEATURES = {
     FOLLOW: {f"{FOLLOW} observation": [*TRACK_FEATURES, *RIG_FEATURES], "rig": [*RIG_FEATURES]},
+    FOLLOW_V1: {f"{FOLLOW_V1} observation": [*TASK_FEATURES], "rig": [*RIG_FEATURES], "tracks": [*TASK_FEATURES]},
     SCHEDULE: {"tracks[]": [*CANDIDATE_FEATURES], "rig": [*RIG_FEATURES]},
 }
 
 
-@pytest.mark.parametrize("name", [FOLLOW, SCHEDULE])
+@pytest.mark.parametrize("name", [FOLLOW, FOLLOW_V1, SCHEDULE])
 def test_an_environment_is_as_listed(name):
     with contextlib.closing(gymnasium.make(f"cotarget.env:{name}")) as env:
         lines = [
@@ -408,7 +410,7 @@ def test_an_environment_is_as_listed(name):
         ]
         observation, info = env.reset(seed=3)
         assert env.observation_space.contains(observation)
-        action = np.zeros(3, np.float32) if name == FOLLOW else 0
+        action = 0 if name == SCHEDULE else np.zeros(3, np.float32)
         _, reward, terminated, truncated, after = env.step(action)
         assert (type(reward), terminated, truncated) == (float, False, False)
         assert info.keys() == after.keys()
@@ -420,7 +422,7 @@ def test_an_environment_is_as_listed(name):
             with pytest.raises(ConfigError) as caught:
                 SchedulingPolicy(env, UNKNOWN)
             assert_listed("policies.txt", last_list(str(caught.value)))
-    with contextlib.closing(gymnasium.make(name, observation="images")) as env:
+    with contextlib.closing(gymnasium.make(name, observation="both" if name == FOLLOW_V1 else "images")) as env:
         lines += span(env.observation_space, f"{name} images", FEATURES[name])
     assert_listed("environments.txt", lines, begins=name)
 

@@ -31,7 +31,7 @@ def target_model(target: Target, hidden: int) -> "mujoco.MjSpec":
     """
     kind = target.kind
     if kind.own is not None:
-        return _own_model(kind.own, kind.name, hidden)
+        return own_model(kind.own, kind.name, hidden)
     spec = kind_model(kind.name)
     scale_spec(spec, target.size)
     if (marker := marker_of(target.name)) != kind.marker:
@@ -51,7 +51,7 @@ def scale_spec(spec: "mujoco.MjSpec", factor: float) -> None:
         element.pos = np.asarray(element.pos) * factor
 
 
-def _own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
+def own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
     """Read a user's target model: lengths in metres, x forward, y left, z up, origin on the path.
 
     The target is rigid. Only bodies and the geoms that are drawn are used.

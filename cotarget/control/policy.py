@@ -1,0 +1,137 @@
+"""What a learnt policy sees and what its actions mean, on the scale of the task.
+
+Angles are counted in half-widths of the present close-up, and focal lengths in logarithms. So the same numbers mean the
+same at every focal length and distance, and on every rig. All of it follows from what the controller has too: the aim,
+the head's motion when a command given now takes effect, and the lens.
+
+The functions work on one rig, or on many at once along the last axis.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cotarget.control.head import HeadSettings
+from cotarget.geometry import Array
+from cotarget.rig import PanTiltLimits
+
+ZOOM_UNIT = 0.1  # change of the logarithm of the focal length that a unit of an action commands in a frame
+FARTHEST = 5.0  # offset beyond which a feature is clipped: the head is then at full speed [half-widths]
+FASTEST = 4.0  # the same for speeds [half-widths a frame]
+ZOOMED = 4.0  # the same for logarithms of focal lengths
+LONGEST_UNSEEN_S = 1.0
+
+# Features of the task with their ranges. Offsets, rates and the command are 0 without a confirmed track.
+TASK_FEATURES = {
+    "known": (0.0, 1.0),  # whether there is a confirmed track
+    "unseen_s": (0.0, LONGEST_UNSEEN_S),  # time since its last detection
+    "pan_off": (-FARTHEST, FARTHEST),  # aim less the head, when a command given now takes effect [half-widths]
+    "tilt_off": (-FARTHEST, FARTHEST),
+    "zoom_off": (-ZOOMED, ZOOMED),  # logarithm of the aim's focal length over the commanded one
+    "pan_rate": (-FASTEST, FASTEST),  # rate of the aim [half-widths a frame]
+    "tilt_rate": (-FASTEST, FASTEST),
+    "zoom_rate": (-1.0, 1.0),  # rate of the logarithm of the aim's focal length [1/frame]
+    "pan_speed": (-FASTEST, FASTEST),  # speed of the head, when a command given now takes effect [half-widths a frame]
+    "tilt_speed": (-FASTEST, FASTEST),
+    "zoom_left": (-ZOOMED, ZOOMED),  # logarithm of the commanded focal length over the lens's
+    "pan": (-1.0, 1.0),  # the aim as an absolute action
+    "tilt": (-1.0, 1.0),
+    "focal": (-1.0, 1.0),
+}
+Numbers = npt.NDArray[Any]  # features or actions, of any precision
+OF_TRACK = [name not in ("pan_speed", "tilt_speed", "zoom_left") for name in TASK_FEATURES]
+LOWEST, HIGHEST = np.array(list(TASK_FEATURES.values()), dtype=np.float32).T
+PAN_OFF, PAN_RATE = (list(TASK_FEATURES).index(name) for name in ("pan_off", "pan_rate"))
+OFF, RATE = slice(PAN_OFF, PAN_OFF + 3), slice(PAN_RATE, PAN_RATE + 3)
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Head and lens as a command given now finds them.
+
+    Attributes:
+        pan_tilt: pan and tilt when it takes effect [rad], (2, ...).
+        speeds: rates of these [rad/s], (2, ...).
+        commanded: logarithm of the last commanded focal length [px], (...).
+        focal: logarithm of the lens's focal length [px], (...).
+        half_width: half the horizontal angle of view, as an angle per pixel times pixels [rad], (...).
+        interval: time between frames [s].
+    """
+
+    pan_tilt: Array
+    speeds: Array
+    commanded: Array
+    focal: Array
+    half_width: Array
+    interval: float
+
+
+def task_features(
+    aim: Array, then: Array, command: Array, known: Array, unseen_s: Array, now: Situation
+) -> npt.NDArray[np.float32]:
+    """Compute the TASK_FEATURES, (..., 14).
+
+    Args:
+        aim: pan, tilt [rad] and logarithm of the focal length [px] that show the target centred and as large as wanted
+            when a command given now takes effect, (3, ...); anything where it is not known.
+        then: the same a frame later.
+        command: the aim as an absolute action, (3, ...).
+        known: whether there is a confirmed track, (...).
+        unseen_s: time since its last detection [s], (...).
+        now: head and lens.
+    """
+    off, rate = aim - np.stack([*now.pan_tilt, now.commanded]), then - aim
+    off[:2] /= now.half_width
+    rate[:2] /= now.half_width
+    speeds = now.speeds * (now.interval / now.half_width)
+    rows = [known, unseen_s, *off, *rate, *speeds, now.commanded - now.focal, *command]
+    found = np.stack(rows, axis=-1)
+    if not np.all(known):
+        found = np.where(np.logical_or(np.asarray(known, bool)[..., None], np.logical_not(OF_TRACK)), found, 0.0)
+    return np.minimum(np.maximum(found.astype(np.float32), LOWEST), HIGHEST)
+
+
+GAIN = 0.35  # part of the offset that the proportional controller corrects in a frame
+
+
+def proportional(features: Numbers) -> Array:
+    """Follow the aim at its rate, correct a part of the offset a frame, and zoom to the wanted size.
+
+    Args:
+        features: TASK_FEATURES, (..., 14). Without a track those of the aim are 0, so that head and lens stand.
+
+    Returns:
+        Actions "rates", (..., 3).
+    """
+    action = features[..., RATE] + GAIN * features[..., OFF]
+    action[..., 2] = features[..., OFF][..., 2] / ZOOM_UNIT
+    return np.clip(action, -1.0, 1.0)
+
+
+def moved_aim(features: Numbers, action: Numbers) -> Array:
+    """Move the aim by an action, in half-widths and zoom units, and follow it by the proportional controller."""
+    moved = np.array(features)
+    moved[..., OFF] += np.clip(action, -1.0, 1.0) * (1.0, 1.0, ZOOM_UNIT)
+    return proportional(moved)
+
+
+def rates_of(action: Numbers, half_width: Array, interval: float) -> Array:
+    """Rates of pan and tilt [rad/s], (2, ...), of actions (..., 3); a unit is half a close-up's width a frame."""
+    pan_tilt = np.clip(np.moveaxis(np.asarray(action, dtype=float), -1, 0)[:2], -1.0, 1.0)
+    return pan_tilt * (half_width / interval)
+
+
+def zoomed(action: Numbers, focal: Array | float, shortest: float, longest: float) -> Array:
+    """Change the logarithm of a commanded focal length by an action (..., 3), within the lens's range [px]."""
+    wanted = focal + ZOOM_UNIT * np.clip(np.asarray(action, dtype=float)[..., 2], -1.0, 1.0)
+    return np.clip(wanted, math.log(shortest), math.log(longest))
+
+
+def ahead_s(limits: PanTiltLimits, interval: float) -> float:
+    """How long the head goes on at a rate if no further command comes [s]; one that jumps goes a frame at a time."""
+    if any(math.isinf(axis.speed) for axis in limits.axes):
+        return interval
+    return max(HeadSettings.ahead_s, HeadSettings.frames_ahead * interval)
