@@ -25,7 +25,7 @@ from tests.support.target_models import BOX
 NO_NOISE = TruthNoise(center_px=0.0, size=0.0, miss=0.0)
 STILL = np.zeros(3, np.float32)
 TELESCOPED = 1e-9  # rounding of a discounted sum
-PLACE_RAD, FOCAL = 1e-4, 1e-4  # of a tabulated aim at 4 m or farther; a step of the head is 9e-4 rad
+PLACE_RAD, FOCAL = 1e-4, 3e-4  # of a tabulated aim at 3 m or farther; a step of the head is 9e-4 rad
 REPORTED_RAD = 1e-3  # a step of the head
 
 
