@@ -94,7 +94,7 @@ def task_features(
     return np.minimum(np.maximum(found.astype(np.float32), LOWEST), HIGHEST)
 
 
-GAIN = 0.35  # part of the offset that the proportional controller corrects in a frame
+GAIN = 0.25  # part of the offset that the proportional controller corrects in a frame
 
 
 def proportional(features: Numbers) -> Array:

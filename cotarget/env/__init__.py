@@ -31,4 +31,6 @@ FOLLOW, FOLLOW_V1, SCHEDULE = "cotarget/Follow-v0", "cotarget/Follow-v1", "cotar
 
 gymnasium.register(FOLLOW, entry_point="cotarget.env.follow:Follow")
 gymnasium.register(SCHEDULE, entry_point="cotarget.env.schedule:Schedule")
-gymnasium.register(FOLLOW_V1, entry_point="cotarget.env.follow_v1:FollowV1")
+gymnasium.register(
+    FOLLOW_V1, entry_point="cotarget.env.follow_v1:FollowV1", vector_entry_point="cotarget.env.batch:FollowBatch"
+)

@@ -294,6 +294,8 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
 
     Attributes:
         config: the rig; each episode sets its targets and seed.
+        given_calibration: the given calibration; None for the exact one of each episode's rig.
+        frames: number of steps of an episode.
         units: units of actions and observations.
     """
 
@@ -332,9 +334,9 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         self.units = Units.of(self.config)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.config.sim.fixed.rate_hz}
-        self._calibration, self._noise, self._observation = calibration, noise, observation
+        self.given_calibration, self._noise, self._observation = calibration, noise, observation
         self._size = int(image_size[0]), int(image_size[1])
-        self._last = max(round(float(seconds) * self.config.sim.fixed.rate_hz), 1)
+        self.frames = max(round(float(seconds) * self.config.sim.fixed.rate_hz), 1)
         self._episode: Episode | None = None
         self._opened: dict[Size, SizedPictures] = {}  # for the present episode
 
@@ -352,7 +354,7 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
     @property
     def calibration(self) -> Calibration:
         """The given calibration, or the exact one of the episode's rig."""
-        return true_calibration(self.episode.world) if self._calibration is None else self._calibration
+        return true_calibration(self.episode.world) if self.given_calibration is None else self.given_calibration
 
     @property
     def times(self) -> tuple[float, float]:

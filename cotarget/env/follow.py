@@ -151,7 +151,7 @@ class Follow(RigEnv[Any, Vector]):
         self._detect()
         judged = self._judge()
         reward = self._reward(judged, self.closeup.t > before)
-        return self._observe(), reward, False, self._index >= self._last, self._info(judged)
+        return self._observe(), reward, False, self._index >= self.frames, self._info(judged)
 
     def _start(self, rig: Rig) -> None:
         """Start tracking and read the first frames of an episode's rig."""
@@ -190,7 +190,7 @@ class Follow(RigEnv[Any, Vector]):
         now = rig.clock.now()
         ages = now - self.wide.t, now - self.closeup.t
         numbers = rig_numbers(
-            self.units, rig.head.state(), rig.zoom.state(), self._commanded, ages, self._index / self._last
+            self.units, rig.head.state(), rig.zoom.state(), self._commanded, ages, self._index / self.frames
         )
         if self._observation != "tracks":
             return {**self._pictures(), "rig": within(numbers, self._rig_space)}

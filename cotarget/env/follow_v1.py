@@ -68,6 +68,12 @@ class FollowV1(Follow):
     half-widths and its size ratio; "shaped" the yield plus gamma times the closeness after the step less that before.
 
     `info` has `potential` besides, the closeness.
+
+    Attributes:
+        action: what actions mean.
+        reward: what is rewarded.
+        gamma: discount of the learner.
+        randomize: ranges of what differs between episodes; None where nothing does.
     """
 
     _kinds = ("tracks", "images", "both")
@@ -106,9 +112,9 @@ class FollowV1(Follow):
         Raises:
             ConfigError: an argument is invalid.
         """
-        self._action, self._kind_of_reward = one_of("action", action, ACTIONS), one_of("reward", reward, REWARDS)
+        self.action, self.reward = one_of("action", action, ACTIONS), one_of("reward", reward, REWARDS)
         require(number_in(gamma, 0.0, 1.0), "gamma", gamma, "a number above 0 and up to 1")
-        self._gamma, self._randomize = float(gamma), randomization_of(randomize)
+        self.gamma, self.randomize = float(gamma), randomization_of(randomize)
         self._variation = Variation()
         super().__init__(target, observation, rig, calibration, seconds, image_size, noise, render_mode)
 
@@ -125,13 +131,17 @@ class FollowV1(Follow):
     def _targets(self) -> Collection[str]:
         return list(dict.fromkeys([*LONE, *self.config.sim.paths]))
 
-    def _path(self, seed: int) -> Mapping[str, tuple[Waypoint, ...]]:
+    def path(self, seed: int) -> tuple[Waypoint, ...]:
+        """Give the target's path in a world of a seed: the rig's own, or a random one."""
         own = self._own_paths()
-        return {self.name: own[self.name]} if self.name in own else lone_path(self.name, seed)
+        return own[self.name] if self.name in own else lone_path(self.name, seed)[self.name]
+
+    def _path(self, seed: int) -> Mapping[str, tuple[Waypoint, ...]]:
+        return {self.name: self.path(seed)}
 
     def _begin(self, seed: int | None, options: Mapping[str, Any] | None) -> int:
         seed = super()._begin(seed, None)
-        drawn = Variation() if self._randomize is None else self._randomize.draw(self.np_random)
+        drawn = Variation() if self.randomize is None else self.randomize.draw(self.np_random)
         self._variation = drawn.with_options(options)
         return seed
 
@@ -156,11 +166,11 @@ class FollowV1(Follow):
         rig = self.episode.rig
         effect_t = rig.clock.now() + rig.spec.head.delay_s
         pan, tilt, focal_px = self.units.command(action)
-        if self._action == "absolute":
+        if self.action == "absolute":
             pan, tilt = rig.head.move(pan, tilt)
             self._head.head.add_command(effect_t, HeadCommand(pan, tilt, None))
         else:
-            rates: Numbers = moved_aim(self._features, action) if self._action == "residual" else np.asarray(action)
+            rates: Numbers = moved_aim(self._features, action) if self.action == "residual" else np.asarray(action)
             command = self._head.turn(effect_t, self._turn_rates(rates), ahead_s(rig.head.limits, self._interval))
             pan, tilt = rig.head.move(command.pan, command.tilt, command.speed)
             focal_px = math.exp(zoomed(rates, self._focal, *rig.zoom.focal_range))
@@ -181,12 +191,12 @@ class FollowV1(Follow):
         return judged
 
     def _reward(self, judged: Closeup, is_new: bool) -> float:
-        if self._kind_of_reward == "dense":
+        if self.reward == "dense":
             return self._potential
         earned = super()._reward(judged, is_new)
-        if self._kind_of_reward == "yield":
+        if self.reward == "yield":
             return earned
-        return float(shaped(earned, self._gamma, self._before, self._potential))
+        return float(shaped(earned, self.gamma, self._before, self._potential))
 
     def _observe(self) -> Any:
         self._features = self._task_features()

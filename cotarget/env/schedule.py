@@ -206,7 +206,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
             self._good_s[name] += passed * well
             reward += passed * well
         reward += self._served_reward * (self._served() - before_served)
-        return self._observe(), reward, False, self._index >= self._last, self._info(good)
+        return self._observe(), reward, False, self._index >= self.frames, self._info(good)
 
     def _end(self) -> None:
         """Close the episode and its pipeline."""
@@ -234,7 +234,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
     def _observe(self) -> dict[str, Any]:
         step = self._step
         ages = step.t - step.fixed.t, step.t - step.zoom.t
-        numbers = rig_numbers(self.units, step.head, step.lens, step.commanded, ages, self._index / self._last)
+        numbers = rig_numbers(self.units, step.head, step.lens, step.commanded, ages, self._index / self.frames)
         candidates = {candidate.id: candidate for candidate in self.candidates}
         rows = [self._candidate_numbers(candidates.get(number or 0)) for number in self._slots]
         seen = {"tracks": within(rows, self._track_space), "rig": within(numbers, self._rig_space)}
