@@ -18,6 +18,7 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
 from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
+from cotarget.estimation.clock_offset import LEAST_S, ClockOffset
 from cotarget.estimation.measurement_model import Pose
 from cotarget.estimation.motion_model import GATE, HEAD_SIGMA
 from cotarget.estimation.target_filter import inflated
@@ -108,6 +109,7 @@ class ZoomSearch:
 
     Attributes:
         states: states of head and lens by time.
+        clock: what the fixed camera's stamps have too much.
         target: the followed target; None for none.
         finder: registers the target; a new one for each followed target.
         waiting: zoom frames without a fixed frame of their time, the oldest first.
@@ -143,7 +145,7 @@ class ZoomSearch:
         self._settings, self._latest_s, self._closed_loop = settings, matching.latest_s, closed_loop
         self._matching, self._sizes = matching, SizeHistory(BEAT_S)  # of the followed target's outline [tangent]
         self._least_variance_px = matching.least_sigma_px**2
-        self.states = StateHistory()
+        self.states, self.clock = StateHistory(), ClockOffset(self._filter.motion)
         self.waiting: deque[Frame] = deque()
         self._zoom_t = math.inf
         self.apart_s = 0.0
@@ -154,6 +156,7 @@ class ZoomSearch:
         """Search for another target from now on; None for none."""
         if target is not self.target:
             self.target = target
+            self.clock.forget_target()
             self.finder, self.unfound_s, self._sizes = self._make_finder(), 0.0, SizeHistory(BEAT_S)
 
     def add_frame(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
@@ -180,7 +183,10 @@ class ZoomSearch:
         if pose is None or estimate is None:
             return None
         target.unlikely = bool(_contradictions(estimate, self._settings))
-        found = self._find(due, pose, estimate)
+        seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
+        if seen is None:
+            return None
+        found = self._find(due, pose, estimate, seen)
         if found is not None:
             # Both cameras show the same point, but wings and limbs move it. With the registration's own error alone,
             # the filter would take their beats for motion of the target.
@@ -194,8 +200,10 @@ class ZoomSearch:
                 pose.nominal_px,
                 due.t,
                 head_sigma=head_sigma,
-                size=self._size(due, found, pose, estimate),
+                time_sigma_s=self.clock.sigma_s,
+                size=self._size(due, found, seen, estimate.target),
             )
+            self.clock.add(target.filter.observations)
         return found
 
     def expect(self, t: float) -> Appearance | None:
@@ -215,6 +223,10 @@ class ZoomSearch:
         found = []
         if wrong := _contradictions(estimate, self._settings):
             found.append(f"the nominal size or the calibration seems wrong: {', '.join(wrong)}")
+        if abs(self.clock.corrected_s) > 2 * LEAST_S:
+            late = "late" if self.clock.corrected_s > 0 else "early"
+            stamps = f"the fixed camera's stamps are {abs(1e3 * self.clock.corrected_s):.0f} ms {late}"
+            found.append(f"{stamps} by how the target moves in both views, and are corrected")
         if abs(self.apart_s) > self._latest_s:
             later = "zoom" if self.apart_s < 0 else "fixed"
             apart = f"the {later} one comes {abs(self.apart_s):.2f} s later"
@@ -253,17 +265,15 @@ class ZoomSearch:
             self.waiting.popleft()
         return due
 
-    def _find(self, frame: Frame, pose: Pose, estimate: Estimate) -> ZoomMeasurement | None:
+    def _find(self, frame: Frame, pose: Pose, estimate: Estimate, seen: Appearance) -> ZoomMeasurement | None:
         """Find the target in a zoom frame.
 
         Args:
             frame: frame of the zoom camera.
             pose: pan, tilt and focal length at its time.
             estimate: estimate of the target at its time.
+            seen: its predicted appearance.
         """
-        seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
-        if seen is None:
-            return None
         # With a wrong size or calibration the gate would never contain the target, so it is widened.
         searched = seen
         if self.is_overdue:
@@ -271,19 +281,22 @@ class ZoomSearch:
             searched = wider.appearance(pose.pan, pose.tilt, pose.nominal_px) or seen
         true = replace(pose, pan=pose.pan + estimate.bias[0], tilt=pose.tilt + estimate.bias[1])
         head_covariance = np.diag(np.square(pose.sigma * seen.focal_px))
+        late_px = self.clock.sigma_s * seen.rate_px
         covariance = searched.covariance + self._least_variance_px * np.eye(2) + head_covariance
+        covariance += np.outer(late_px, late_px)
         found = self.finder.find(frame, estimate.x_fixed, covariance, true)
         self._count_unfound(frame, found, replace(seen, covariance=seen.covariance + head_covariance), estimate)
         return found
 
-    def _size(self, frame: Frame, found: ZoomMeasurement, pose: Pose, estimate: Estimate) -> tuple[float, float] | None:
+    def _size(
+        self, frame: Frame, found: ZoomMeasurement, seen: Appearance, profile: TargetProfile
+    ) -> tuple[float, float] | None:
         """Measure the wingspan of a target found in a zoom frame [tangent], and its relative standard deviation.
 
         The fixed camera shows a far bird's body, and a part of a near one before trees. A height is left to the fixed
         camera, which shows feet and shadow apart as well.
         """
-        seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
-        if seen is None or not estimate.target.largest_over_time:
+        if not profile.largest_over_time:
             return None
         sides_px = outline_size(frame.image, found.center_px, seen.size_px, self._matching)
         if sides_px is None:

@@ -669,7 +669,8 @@ class Run:
     def step(self) -> Step:
         """Process one frame of the fixed camera, in the order of the paper's Table 1."""
         frames, head = self._frames, self.head
-        frame = frames.read_fixed()
+        shown = frames.read_fixed()
+        frame = replace(shown, t=shown.t - head.search.clock.correct())
         detections, tracks = self.camera.track(frame), self.camera.tracks
         favoured = {track.id for track in tracks if head.selector.favours(track)}
         self.fusion.add_shift(detections.shift, cut=detections.cut)
@@ -686,7 +687,7 @@ class Run:
             t=self._rig.clock.now(),
             state=state,
             reason=_joined([*reasons, *head.search.warnings(estimate), *self.fusion.warnings(), *frames.faults()]),
-            fixed=frame,
+            fixed=shown,
             zoom=zoom,
             mask=detections.mask,
             detections=tuple(detections.boxes),

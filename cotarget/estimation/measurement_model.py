@@ -22,6 +22,8 @@ from cotarget.estimation.motion_model import (
     TAN_X,
     TAN_Y,
     TILT,
+    VEL_Z,
+    VELOCITY,
     MotionSettings,
 )
 from cotarget.geometry import Array
@@ -126,6 +128,11 @@ class SightLines:
         return SightLine(view, after_pan @ unpan_slope @ self._fixed, turn @ panned)
 
 
+def rate(x: Array) -> Array:
+    """Rates of both tangents and of the depth's logarithm in a state, (3,) [1/s]."""
+    return np.asarray(x[VELOCITY] - x[VEL_Z] * np.array([x[TAN_X], x[TAN_Y], 0.0]))
+
+
 _SEEN_TWICE = np.ix_(SEEN, SEEN)
 
 
@@ -140,6 +147,7 @@ class Appearance:
         size_sigma: standard deviation of that size, relative.
         focal_px: true focal lengths (fx, fy), (2,) [px].
         sides: width and height of its box in the zoom image, relative to that size.
+        rate_px: velocity of the offset while the head stands, (2,) [px/s].
     """
 
     offset_px: Array
@@ -148,6 +156,7 @@ class Appearance:
     size_sigma: float
     focal_px: Array
     sides: tuple[float, float] = (1.0, 1.0)
+    rate_px: Array | float = 0.0
 
     @property
     def sigma_px(self) -> Array:
@@ -264,4 +273,5 @@ class Estimate:
             size_sigma=math.sqrt(max(float(OF_SIZE @ P @ OF_SIZE), 0.0)),
             focal_px=focal,
             sides=target.turned(sides, turn),
+            rate_px=J[:, :3] @ rate(x),
         )

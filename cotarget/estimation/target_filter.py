@@ -10,13 +10,14 @@ by itself is as good as the calibration. Gates and inflations: docs/design-notes
 
 import bisect
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
-from cotarget.estimation.measurement_model import Estimate, SightLine, SightLines
+from cotarget.estimation.measurement_model import Estimate, SightLine, SightLines, rate
 from cotarget.estimation.motion_model import (
     ACC_Z,
     ACCELERATION,
@@ -109,6 +110,7 @@ class Observation:
             where no size was observed.
         log_depth_sigma: standard deviation of that logarithm.
         bound: whether it is an upper bound only: a clipped target is at least that large, so at most that far.
+        time_sigma_s: standard deviation of its time against the fixed camera's [s].
     """
 
     t: float
@@ -118,6 +120,7 @@ class Observation:
     log_depth: float | None = None
     log_depth_sigma: float = math.inf
     bound: bool = False
+    time_sigma_s: float = 0.0
 
     @property
     def order(self) -> tuple[float, bool]:
@@ -155,7 +158,7 @@ def correct_fixed(node: Node, observed: Observation, settings: FilterSettings) -
         node = _with_fading_velocity(node, settings)
     PHt = node.P[:, :2]
     innovation = observed.tangent - node.x[:2]
-    R = observed.R * _variance_factor(node.t - node.fixed_t, settings.noise_s)
+    R = observed.R * variance_factor(node.t - node.fixed_t, settings.noise_s)
     S_inv = _inverse(PHt[:2] + R)
     nis = float(innovation @ S_inv @ innovation)
     if nis > settings.jump_gate:
@@ -186,7 +189,8 @@ def correct_zoom(node: Node, observed: Observation, sight: SightLine, settings: 
         tangent, J, d = sight.project(x)
         innovation = observed.tangent - tangent + J @ (x - node.x)[SEEN]
         PHt = node.P[:, SEEN] @ J.T
-        S_inv = _inverse(J @ PHt[SEEN] + observed.R)
+        late = J[:, :3] @ rate(x) * observed.time_sigma_s
+        S_inv = _inverse(J @ PHt[SEEN] + observed.R + np.outer(late, late))
         if i == 0:
             nis = float(innovation @ S_inv @ innovation)
         if d[2] <= 0 or nis > CENTER_GATE:
@@ -216,7 +220,7 @@ def _correct_size(node: Node, observed: Observation, settings: FilterSettings) -
         return node
     P, h = node.P, OF_SIZE
     # Limbs and wings move the box's sides together for a while, so sizes in quick succession share their error.
-    variance = observed.log_depth_sigma**2 * _variance_factor(node.t - last_t, settings.size_s)
+    variance = observed.log_depth_sigma**2 * variance_factor(node.t - last_t, settings.size_s)
     Ph = P @ h
     S = float(h @ Ph) + variance
     innovation = observed.log_depth - float(h @ node.x)
@@ -284,7 +288,7 @@ def inflated(P: Array, settings: FilterSettings) -> Array:
     return P
 
 
-def _variance_factor(interval: float, correlation_s: float) -> float:
+def variance_factor(interval: float, correlation_s: float) -> float:
     """Factor on a variance whose error lasts correlation_s [s], for measurements an interval > 0 apart [s]."""
     return max(1.0, 2 * correlation_s / interval)
 
@@ -379,6 +383,7 @@ class TargetFilter:
         t: float,
         *,
         head_sigma: float = HEAD_SIGMA,
+        time_sigma_s: float = 0.0,
         size: tuple[float, float] | None = None,
     ) -> bool:
         """Add a centre of the target in the zoom image, which corrects the 3D state, see `correct_zoom`.
@@ -392,6 +397,7 @@ class TargetFilter:
             t: exposure time of the frame [s].
             head_sigma: standard deviation of the reported angles [rad]; larger while the head moves and the time is
                 uncertain.
+            time_sigma_s: standard deviation of that time against the fixed camera's [s].
             size: known dimension in the zoom image [tangent], and its relative standard deviation, if it was measured.
 
         Returns:
@@ -404,7 +410,13 @@ class TargetFilter:
         z, J = found
         R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * head_sigma**2
         log_depth, sigma = (None, math.inf) if size is None else (math.log(self._target.size / size[0]), size[1])
-        return self._insert(Observation(t, z, R, self._sight_lines.at(pan, tilt, nominal_px), log_depth, sigma))
+        sight = self._sight_lines.at(pan, tilt, nominal_px)
+        return self._insert(Observation(t, z, R, sight, log_depth, sigma, time_sigma_s=time_sigma_s))
+
+    @property
+    def observations(self) -> Sequence[Observation]:
+        """Observations of the last `history_s`, in the order of time."""
+        return self._observed
 
     def estimate(self, t: float) -> Estimate | None:
         """Estimate the target at a time [s], after the newest measurement or up to `history_s` before it.

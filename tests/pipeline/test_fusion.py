@@ -4,6 +4,7 @@ The fixed camera looks along z from the origin and the zoom camera from 0.4 m to
 """
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.control.selection import FirstCome, candidates_of
+from cotarget.estimation import TargetFilter
 from cotarget.estimation.zoom_matching import CloseupFinder, MatchingSettings, ZoomMeasurement
 from cotarget.fusion import REMEMBERED_S, FusionSettings, StateHistory, TargetFusion, ZoomSearch
 from cotarget.geometry import pose
@@ -23,6 +25,7 @@ from cotarget.sim.motion import trapezoid
 from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
 from tests.support.formula_rig import FormulaRig
+from tests.support.moving_targets import APART, Flight, show
 from tests.support.rigs import rig_of
 
 SIZE, CENTER, FOCAL, ZOOMED = (640, 480), (319.5, 239.5), 700.0, 3000.0
@@ -531,6 +534,25 @@ def test_cameras_of_different_latencies_are_fused_at_equal_times(by):
 def test_cameras_too_far_apart_in_time_are_reported(by, later):
     warnings = apart(by)[2]
     assert warnings == [f"the cameras are too far apart in time: the {later} one comes 1.40 s later"]
+
+
+def test_late_stamps_are_named_and_corrected():
+    """Both views of a simulated bird, by stamps 60 ms late, are added to the search's own estimate of the clocks."""
+    flight = Flight("bird", 300)
+    fusion, target_filter = Pair(BIRD, followed=1), TargetFilter(flight.calibration, BIRD)
+    t = seen(fusion, lambda t: [track(1, box_at(*X), t)], 5)
+    assert fusion.warnings(t) == []
+    for t_true in flight.times:
+        box, view = flight.wide(t_true), flight.zoom(t_true + APART)
+        if box is not None:
+            target_filter.add_fixed(box, t_true + 0.06)
+        if view is not None:
+            show(target_filter, view)
+        fusion.search.clock.add(target_filter.observations)
+    for _ in range(20):
+        fusion.search.clock.correct()
+    (warning,) = fusion.warnings(t)
+    assert re.match("the fixed camera's stamps are [567]. ms late", warning)
 
 
 def test_zoom_frames_without_a_fixed_frame_of_their_time_cause_no_warning():
