@@ -69,6 +69,26 @@ def check_board_size(rig: Path, config: "RigConfig") -> None:
     check_square(config.board.square, f"{rig}: board.square")
 
 
+CONSENT = "yes"
+
+
+def ask(consented: bool, question: str, refusal: str) -> None:
+    """Ask for consent, unless --yes has given it.
+
+    Raises:
+        ConfigError: the answer is not yes, or there is none; ``refusal`` says what was not done.
+    """
+    if consented:
+        return
+    print(f"{question} [yes/no]", flush=True)
+    try:
+        answer = sys.stdin.readline() if sys.stdin is not None else ""
+    except (OSError, ValueError):  # closed terminal, closed file, or not text
+        answer = ""
+    if answer.strip().lower() != CONSENT:
+        raise ConfigError(f"{refusal}; it needs the answer yes, or --yes")
+
+
 # Results
 
 

@@ -154,8 +154,8 @@ def _notes(end: BaseException) -> list[str]:
 DESCRIPTION = "A fixed camera finds a small target; a zoom camera on a pan-tilt head shows it large."
 # In an order of use. Each has a module, whose docstring is the help; `add` adds the options, and `run` runs it.
 COMMANDS = (
-    "demo", "config", "doctor", "view", "board", "where", "point", "home", "latency", "calibrate", "report", "aim",
-    "follow", "replay", "detect", "stop", "clear", "reset-head", "emulate",
+    "demo", "config", "doctor", "view", "board", "where", "point", "home", "learn", "latency", "calibrate", "report",
+    "aim", "follow", "replay", "detect", "stop", "clear", "reset-head", "emulate",
 )  # fmt: skip
 
 

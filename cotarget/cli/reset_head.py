@@ -1,18 +1,14 @@
 """Let the pan-tilt head find its limits; it turns through its whole range: `cotarget reset-head`."""
 
 import argparse
-import sys
 from typing import TYPE_CHECKING
 
-from cotarget.cli.common import add_rig
+from cotarget.cli.common import add_rig, ask
 from cotarget.errors import ConfigError
 
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
     from cotarget.drivers.rig import Device
-
-
-CONSENT = "yes"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     if not hasattr(head.driver, "reset"):
         _trust_position(options, config, head)
         return
-    _ask(options, "The head will turn through its whole range. Are camera and cables clear of it?")
+    ask(options.yes, "The head will turn through its whole range. Are camera and cables clear of it?", "not reset")
     look, undo = StopLook(config.safety.stop_file), end_politely()
     try:
         with rig_lock(*addresses_of(head.settings), file=options.rig):
@@ -57,23 +53,6 @@ def _trust_position(options: argparse.Namespace, config: "RigConfig", head: "Dev
     lost = PositionLostMarker(head.address, config.safety.stop_file)
     if not lost.files():
         raise ConfigError(f"{options.rig}: the driver of {head.where} has no reset; the unit needs none")
-    _ask(options, "The unit has no reset; switch it off and on. Does it stand where it reports?")
+    ask(options.yes, "The unit has no reset; switch it off and on. Does it stand where it reports?", "not reset")
     lost.forget()
     print("reset: the reported position counts as true again")
-
-
-def _ask(options: argparse.Namespace, question: str) -> None:
-    """Ask for consent, unless --yes gives it.
-
-    Raises:
-        ConfigError: the answer is not yes, or there is none.
-    """
-    if options.yes:
-        return
-    print(f"{question} [yes/no]", flush=True)
-    try:
-        answer = sys.stdin.readline() if sys.stdin is not None else ""
-    except (OSError, ValueError):  # closed terminal, closed file, or not text
-        answer = ""
-    if answer.strip().lower() != CONSENT:
-        raise ConfigError("not reset; it needs the answer yes, or --yes")

@@ -86,6 +86,7 @@ class OnvifSettings(PtzSettings):
         slack_deg: largest distance of the reported position from the goal where it has arrived [degrees].
         status_delay_s: by how much the positions that it reports are late, as measured [s].
         zoom_s: time that the lens takes from end to end [s].
+        absolute: whether it obeys absolute moves of pan and tilt; false to steer it by velocities although it says so.
         all_axes: whether each move names pan, tilt and zoom; for a device that takes a missing one as 0.
     """
 
@@ -95,6 +96,7 @@ class OnvifSettings(PtzSettings):
     status_delay_s: NotNegative = 0.0
     zoom_s: Positive = 10.0
     speed_deg_s: Positive = 100.0
+    absolute: bool = True
     all_axes: bool = False
 
 
@@ -553,7 +555,7 @@ class OnvifLink(PtzLink):
             self._steer(requests)
             return
         zoom = self._goal_or_place(2, now) if self._settings.all_axes else None
-        fastest = self._settings.speed_deg_s
+        fastest = self._fastest_deg_s
         pan, tilt = (min(speed / fastest, 1.0) for speed in speeds)
         self._absolute(goals, zoom, (pan, tilt), requests)
         for reckoned, goal, speed in zip(self._reckoned[:2], goals, speeds, strict=True):

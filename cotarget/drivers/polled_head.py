@@ -689,6 +689,10 @@ class PolledLens:
         """Shortest and longest nominal focal length [px]."""
         return self._positions.focal_range
 
+    def number(self, focal_px: float) -> float:
+        """Return the unit's number of the position nearest to a nominal focal length [px]."""
+        return self._positions.position_for(focal_px)
+
     def zoom(self, focal_px: float) -> float:
         """Start the lens moving and return at once the focal length that it will reach [px].
 

@@ -208,6 +208,10 @@ class DomeCamera:
         """Return the lens's state, see `PolledLens.state`."""
         return self._lens.state()
 
+    def number(self, focal_px: float) -> float:
+        """Return the device's number of the lens position nearest to a nominal focal length [px]."""
+        return self._lens.number(focal_px)
+
     def describe(self) -> str:
         """Describe the stream in one line, see `StreamReader.describe`."""
         return self._stream.describe()

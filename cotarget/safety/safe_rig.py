@@ -213,6 +213,11 @@ class SafeZoomCamera(SafeCamera):
         """Return the lens's state now."""
         return self._device.state()
 
+    def number(self, focal_px: float) -> float | None:
+        """Return the device's own number of a nominal focal length [px]; None where its driver has none."""
+        number: Callable[[float], float] | None = getattr(self._device, "number", None)
+        return None if number is None else number(focal_px)
+
     def capture(self) -> Frame:
         """Take a full still. It may be old when it arrives, because it is large, but not older than the request.
 

@@ -16,6 +16,7 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers import onvif
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.onvif import OnvifDevice, OnvifDome, OnvifLink
+from cotarget.drivers.rig import device_of
 from cotarget.emulators.onvif import ANSWERS, PAN_TILT, TPTZ, TRT, OnvifCamera, SoapFault
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
@@ -635,3 +636,26 @@ def test_no_thread_is_left():
 def test_wrong_limits_are_refused():
     with OnvifUnit("degrees") as unit, pytest.raises(ConfigError, match="pan_deg"):
         OnvifDome(dataclasses.replace(unit.settings, pan_deg=(-90.0, 90.0)), MonotonicClock(), SAFETY)
+
+
+def test_a_dome_that_is_slow_when_zoomed_in_is_driven_by_its_speed_there():
+    """At its longest the emulated dome turns by 1.5 degrees/s at full speed: a share of 100 would take 100 s."""
+    zoomed = ((1.5, 30.0), (2.5, 7.85), (4.0, 4.5), (6.4, 1.5))
+    with OnvifUnit("capped-by-zoom") as unit, opened(unit, zoomed_speeds=zoomed) as dome:
+        assert dome.head.limits.pan.speed == pytest.approx(math.radians(100.0))
+        dome.zoom.zoom(dome.zoom.focal_range[1])
+        wait_for(lambda: not dome.zoom.state().moving and unit.lens.position() == unit.lens.last)
+        begin = time.monotonic()
+        dome.head.move(math.radians(1.0), 0.0, math.radians(1.0), wait=True)
+        assert 1.0 <= time.monotonic() - begin < 3.0
+
+
+def test_speeds_that_rise_with_the_zoom_are_refused():
+    with pytest.raises(ConfigError, match=r"hardware\.ptz\.zoomed_speeds"):
+        device_of("ptz", {"driver": "onvif", "host": "127.0.0.1", "zoomed_speeds": [[2, 10], [4, 20]]})
+
+
+def test_a_dome_that_ignores_absolute_moves_is_steered_where_the_file_says_so():
+    with OnvifUnit("absolute-ignored") as unit, opened(unit, absolute=False) as dome:
+        dome.head.move(math.radians(12.0), math.radians(4.0), wait=True)
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((12.0, 4.0), abs=0.3)

@@ -1,0 +1,103 @@
+"""A dome is learnt from its picture: a textured sphere in simulated time, and facts that are drawn by seed."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cotarget.bringup import fit_pictures, growth_of, learn, orientation_of, room_of, start_of_turns
+from tests.support.rigs import rig_of
+from tests.support.textured_dome import LATENCY_S, LONGEST, SIZE, WIDE_PX, TexturedDome
+
+SAME_SCALE = 0.01
+SAME_FOCAL = 0.02
+SAME_DELAY_S, SAME_STOP_S = 0.02, 0.03
+SAME_GROWTH = 0.02
+BRAKING_S = 6.0 / 800 / 2  # half of the time to the speed of slow turns
+
+
+def grey(dome, pan_deg, tilt_deg, focal=WIDE_PX):
+    return dome.picture(math.radians(pan_deg), math.radians(tilt_deg), focal)[:, :, 0]
+
+
+def learnt(dome):
+    rig = rig_of(dome)
+    return learn(rig, room_of(rig), lambda line: None)
+
+
+def drawn(seed):
+    """A dome that lies in many ways."""
+    random = np.random.default_rng(seed)
+    return TexturedDome(
+        seed,
+        scale=tuple(random.choice([-1, 1], 2) * random.uniform(0.8, 1.25, 2)),
+        upside_down=bool(random.integers(2)),
+        mirrored=bool(random.integers(2)),
+        delay_s=random.uniform(0.03, 0.3),
+        late_s=float(random.choice([0.0, 0.5])),
+        stop_s=random.uniform(0.0, 1.1),
+        round_deg=float(random.choice([0.0, 0.4])),
+        curve=random.uniform(-0.4, 0.4),
+        turns_at_zoom=bool(random.integers(2)),
+    )
+
+
+# The whole of it is 40 s of pictures; one seed runs always.
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 9))])
+def test_what_a_dome_does_is_learnt_from_its_picture(seed):
+    dome = drawn(seed)
+    found = learnt(dome)
+    assert found.moves
+    words = (["upside down"] if dome.upside_down else []) + (["mirrored"] if dome.mirrored else [])
+    assert found.orientation == (" and ".join(words) or "upright")
+    assert found.scale == pytest.approx(dome.scale, rel=SAME_SCALE)
+    assert found.focal_px == pytest.approx(WIDE_PX, rel=SAME_FOCAL)
+    assert found.light_s == pytest.approx(dome.delay_s + LATENCY_S + BRAKING_S, abs=SAME_DELAY_S)
+    assert found.report_s == pytest.approx(LATENCY_S - dome.late_s, abs=SAME_DELAY_S)
+    assert found.stop_s == pytest.approx(dome.stop_s, abs=SAME_STOP_S)
+    assert found.turns_at_zoom == dome.turns_at_zoom
+    assert found.is_whole
+    for nominal, times in found.growths:
+        share = math.log(nominal / WIDE_PX) / math.log(LONGEST)
+        assert times == pytest.approx(LONGEST ** (share + dome.curve * share * (1 - share)), rel=SAME_GROWTH)
+    assert found.missed_deg <= dome.round_deg / 2 + 1e-9
+
+
+def test_a_dome_that_does_not_move_is_found_out():
+    assert not learnt(TexturedDome(obeys=False)).moves
+
+
+def test_the_focal_length_is_seen():
+    dome = TexturedDome()
+    places = [(0, 0), (9, 4), (-12, 6), (14, -7), (-8, -9), (3, 10)]
+    focal_px, turns, used = fit_pictures([grey(dome, *place) for place in places], 1.2 * WIDE_PX, SIZE)
+    assert used == [1, 2, 3, 4, 5]
+    assert focal_px == pytest.approx(WIDE_PX, rel=SAME_FOCAL)
+    angles = np.degrees([turn.magnitude() for turn in turns])
+    assert angles == pytest.approx([math.hypot(*place) for place in places[1:]], rel=0.02)
+
+
+def test_growth_and_orientation():
+    dome = TexturedDome()
+    before, after = grey(dome, 0, 0), grey(dome, 1.0, 0, 1.4 * WIDE_PX)
+    times, moved_px = growth_of(before, after)
+    assert times == pytest.approx(1.4, rel=SAME_GROWTH)
+    assert moved_px == pytest.approx(1.4 * WIDE_PX * math.tan(math.radians(1.0)), abs=1.0)
+    fixed = dome.picture(0.1, 0.0, WIDE_PX)
+    turned = {"upright": before, "upside down": before[::-1, ::-1], "mirrored": before[:, ::-1]}
+    for said, image in turned.items():
+        assert orientation_of([np.ascontiguousarray(image)], fixed) == said
+    assert orientation_of([np.full(SIZE[::-1], 90, np.uint8)], fixed) == ""
+
+
+@pytest.mark.parametrize("takes", [0.02, 0.7])
+def test_the_start_of_turns_lies_between_frames(takes):
+    """Frames every 0.1 s of turns that begin 0.23 s after their commands, at once or slowly."""
+    turns = []
+    for phase in (0.0, 0.03, 0.06, 0.01, 0.05, 0.08):
+        times = np.arange(-phase, 2.0, 0.1)
+        turns.append((times, np.clip((times - 0.23) / takes, 0.0, 1.0)))
+    start, rate = start_of_turns(turns)
+    assert start == pytest.approx(0.23, abs=0.015)
+    if takes > 0.1:
+        assert rate == pytest.approx(1 / takes, rel=0.02)
