@@ -36,6 +36,7 @@ from cotarget.latency import AGREEMENT, delay_between
 from cotarget.rig import Angles, Frame, Image, PanTiltState, Rig
 
 Say = Callable[[str], None]
+Pairs = tuple[tuple[float, float], ...]
 Got = TypeVar("Got")
 
 REDUCED_PX = 640  # larger width of pictures that are compared
@@ -66,6 +67,9 @@ WHOLE = 0.95  # part of that way beyond which it was not halted
 LATEST_S = 2.0  # longest time from a command to the motion in the picture [s]
 LOOK_S = 0.01  # longest wait for a frame before the head's state is read again [s]
 ZOOM_STEPS = 16
+# The highest speed is seen at every third of these, by a turn of such a way, that is halted after such a time; with it
+# goes a little tilt, for a dome that moves only where both axes change.
+SPEED_EVERY, FAST_DEG, FAST_S, TINY = 3, 12.0, 1.5, math.radians(0.3)
 TURNED_DEG = 1.0  # by which the picture moves at a zoom whose device turns
 
 
@@ -86,6 +90,7 @@ class Learnt:
         stop_s: from a halt to standing, less the time from a command to motion; None where it was not seen.
         turns_at_zoom: whether it turns when only the zoom is sent.
         growths: zoom positions as focal lengths of rig.toml [px], and magnifications.
+        speeds: magnifications, and the highest speed of pan that was reported there [rad/s]; empty without reports.
     """
 
     moves: bool
@@ -100,6 +105,7 @@ class Learnt:
     stop_s: float | None = None
     turns_at_zoom: bool = False
     growths: tuple[tuple[float, float], ...] = ()
+    speeds: tuple[tuple[float, float], ...] = ()
 
     @property
     def is_whole(self) -> bool:
@@ -172,7 +178,7 @@ def learn(rig: Rig, room: Room, say: Say) -> Learnt:
     _go(rig, room.middle)
     both_axes = not _go(rig, (room.middle[0] + math.radians(RAMP_DEG), room.middle[1]))[1]
     say("zooming")
-    turns, growths = _zoom_through(rig, room, focal_px)
+    turns, growths, speeds = _zoom_through(rig, room, focal_px, say, reports=report_s is not None)
     return Learnt(
         moves=True,
         orientation=orientation,
@@ -186,6 +192,7 @@ def learn(rig: Rig, room: Room, say: Say) -> Learnt:
         stop_s=stop_s,
         turns_at_zoom=turns,
         growths=growths,
+        speeds=tuple((times, abs(scale[0]) * speed) for times, speed in speeds),
     )
 
 
@@ -641,20 +648,29 @@ def growth_of(before: Image, after: Image) -> tuple[float, float] | None:
     return math.hypot(*fit.x[:2]), math.hypot(*fit.x[2:4])
 
 
-def _zoom_through(rig: Rig, room: Room, focal_px: float) -> tuple[bool, tuple[tuple[float, float], ...]]:
-    """Zoom from end to end; return `Learnt.turns_at_zoom` and `growths`."""
+def _zoom_through(rig: Rig, room: Room, focal_px: float, say: Say, *, reports: bool) -> tuple[bool, Pairs, Pairs]:
+    """Zoom from end to end; return `Learnt.turns_at_zoom`, `growths` and `speeds`, of the head's reports."""
     shortest, longest = rig.zoom.focal_range
     steps = np.geomspace(shortest, longest, ZOOM_STEPS + 1)[1:].tolist()
     before, _ = _go(rig, _goal(room, PLACES[3]))
-    _zoom(rig, steps[0])
+    try:
+        _zoom(rig, steps[0])
+    except EmergencyStopError:
+        raise
+    except DeviceError as error:
+        say(f"the lens does not go where it is sent: {error}")
+        return False, ((shortest, 1.0),), ()
     again = growth_of(before, _zoom(rig, shortest))
     turned_px = math.tan(math.radians(TURNED_DEG)) * focal_px * before.shape[1] / rig.zoom.size[0]
     turns = again is None or again[1] > turned_px
     if not turns:
         _go(rig, room.middle)
     before = _zoom(rig, shortest)
-    growths = [(shortest, 1.0)]
-    for focal in steps:
+    growths, speeds = [(shortest, 1.0)], list[tuple[float, float]]()
+    for i, focal in enumerate(steps):
+        if reports and i % SPEED_EVERY == 0:
+            speeds.append((growths[-1][1], _highest_speed(rig, room)))
+            before, _ = _go(rig, room.middle)
         reached = rig.zoom.zoom(focal)
         after = _zoom(rig, focal)
         found = growth_of(before, after)
@@ -663,7 +679,22 @@ def _zoom_through(rig: Rig, room: Room, focal_px: float) -> tuple[bool, tuple[tu
         growths.append((reached, growths[-1][1] * found[0]))
         before = after
     rig.zoom.zoom(shortest)
-    return turns, tuple(growths)
+    return turns, tuple(growths), tuple(speeds)
+
+
+def _highest_speed(rig: Rig, room: Room) -> float:
+    """Turn at full speed for a while; return the highest speed of pan that the head reports [rad/s]."""
+    frame, end, states = _next(rig), rig.clock.now() + FAST_S, list[PanTiltState]()
+    _patiently(lambda: rig.head.move(room.middle[0] + math.radians(FAST_DEG), room.middle[1] + TINY))
+    while rig.clock.now() < end:
+        states.append(_patiently(rig.head.state))
+        with contextlib.suppress(StaleFrameError):
+            frame = rig.zoom.read(newer_than=frame.t, timeout=LOOK_S)
+    _patiently(rig.head.halt)
+    return max(
+        (abs(b.pan - a.pan) / (b.t - a.t) for a, b in itertools.combinations(states, 2) if b.t - a.t > FAST_S / 10),
+        default=0.0,
+    )
 
 
 def _zoom(rig: Rig, focal_px: float) -> Image:

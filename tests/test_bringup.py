@@ -13,6 +13,7 @@ SAME_SCALE = 0.01
 SAME_FOCAL = 0.02
 SAME_DELAY_S, SAME_STOP_S = 0.02, 0.03
 SAME_GROWTH = 0.02
+SAME_SPEED = 0.05
 BRAKING_S = 6.0 / 800 / 2  # half of the time to the speed of slow turns
 
 
@@ -39,6 +40,7 @@ def drawn(seed):
         round_deg=float(random.choice([0.0, 0.4])),
         curve=random.uniform(-0.4, 0.4),
         turns_at_zoom=bool(random.integers(2)),
+        cap_deg_s=random.uniform(2.0, 20.0),
     )
 
 
@@ -60,6 +62,12 @@ def test_what_a_dome_does_is_learnt_from_its_picture(seed):
     for nominal, times in found.growths:
         share = math.log(nominal / WIDE_PX) / math.log(LONGEST)
         assert times == pytest.approx(LONGEST ** (share + dome.curve * share * (1 - share)), rel=SAME_GROWTH)
+    for times, speed in found.speeds:
+        if times > LONGEST**0.65:
+            assert math.degrees(speed) == pytest.approx(dome.cap_deg_s, rel=SAME_SPEED)
+        elif times < LONGEST**0.35:
+            assert math.degrees(speed) > 20.0
+    assert len(found.speeds) == 6
     assert found.missed_deg <= dome.round_deg / 2 + 1e-9
 
 

@@ -1,6 +1,7 @@
 """Turn and zoom a dome, learn from its own picture what it does, and print that for rig.toml: `cotarget learn`."""
 
 import argparse
+import itertools
 import math
 import sys
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ SURE_DEG = 0.2  # rms angle beyond which positions are not where the picture sho
 SHARE = 1.3  # of the largest distance from the goal that was seen: the next may be larger
 USUAL_DELAY_S = 0.05  # from a command to motion, where it is not seen apart from the picture's delay
 SHORTEST_S = 0.02  # no stream is faster
+SLOWER = 0.8  # of the highest speed, below which it depends on the zoom
 DIGITS = 3
 
 
@@ -93,6 +95,8 @@ def _keys(settings: "PtzSettings", learnt: "Learnt", rig: "Rig") -> dict[str, An
         keys["wide_deg"] = round(math.degrees(2 * math.atan(settings.size[0] / 2 / learnt.focal_px)), 1)
     if learnt.is_whole:
         keys["lens"] = list(_lens(learnt, rig))
+    if speeds := _zoomed_speeds(learnt):
+        keys["zoomed_speeds"] = speeds
     keys |= _delays(settings, learnt)
     if learnt.missed_deg > getattr(settings, "slack_deg", math.inf) + max(settings.steps_deg):
         keys["slack_deg"] = round(SHARE * learnt.missed_deg, 2)
@@ -109,6 +113,17 @@ def _lens(learnt: "Learnt", rig: "Rig") -> Iterator[list[float]]:
         if number > last[0] and times > last[1]:
             last = number, times
             yield [round(number, 4), round(times, 3)]
+
+
+def _zoomed_speeds(learnt: "Learnt") -> list[list[float]]:
+    """List from which magnification on which speed is the highest; it may be slow from the last fast one on."""
+    slow: list[list[float]] = []
+    fastest = learnt.speeds[0][1] if learnt.speeds else 0.0
+    for (times, _), (_, speed) in itertools.pairwise(learnt.speeds):
+        if speed < SLOWER * fastest:
+            fastest = speed
+            slow.append([round(times, 2), round(math.degrees(speed), 1)])
+    return slow
 
 
 def _delays(settings: "PtzSettings", learnt: "Learnt") -> dict[str, float]:
@@ -150,10 +165,14 @@ def _words(settings: "PtzSettings", learnt: "Learnt", keys: dict[str, Any]) -> I
         yield "It reports no positions while it moves."
     if learnt.stop_s is not None:
         yield f"It turns on for {max(learnt.stop_s + keys['command_delay_s'], 0.0):.2f} s after a halt."
+    if "zoomed_speeds" in keys:
+        yield f"It turns by {keys['zoomed_speeds'][-1][1]:g} degrees/s at most when zoomed in."
     if learnt.turns_at_zoom:
         yield "It turns when only the zoom is sent."
     times = learnt.growths[-1][1]
-    if learnt.is_whole:
+    if len(learnt.growths) == 1:
+        yield "Its picture was not seen to grow with the zoom: keep `lens` as it is."
+    elif learnt.is_whole:
         yield f"It magnifies {times:.1f} times."
     else:
         yield (

@@ -53,6 +53,7 @@ def test_what_was_learnt_becomes_keys(dome, capsys, monkeypatch):
         stop_s=0.4,
         turns_at_zoom=True,
         growths=growths,
+        speeds=((1.0, 1.0), (1.5, 0.9), (2.5, 0.3), (4.0, 0.29), (6.0, 0.1)),
     )
     monkeypatch.setattr(bringup, "learn", lambda *arguments: learnt)
     status, out, err = call(capsys, "learn", "--rig", dome.file, "--yes")
@@ -65,6 +66,7 @@ def test_what_was_learnt_becomes_keys(dome, capsys, monkeypatch):
     assert (keys["latency_s"], keys["command_delay_s"]) == (0.24, 0.06)
     assert keys["slack_deg"] >= 0.5
     assert keys["all_axes"] is True
+    assert keys["zoomed_speeds"] == [[1.5, 17.2], [4.0, 5.7]]  # 0.3 and 0.1 rad/s
     assert keys["lens"][0] == [0.0, 1.0]
     assert keys["lens"][-1] == [1.0, 8.0]
     assert "turns on for 0.46 s after a halt" in err

@@ -46,6 +46,7 @@ class TexturedDome:
         curve: of the magnification in the logarithm of the nominal focal length.
         turns_at_zoom: whether a zoom sends the head to 0, 0.
         obeys: whether it goes where it is sent.
+        cap_deg_s: highest speed beyond half of the zoom's range.
     """
 
     seed: int = 0
@@ -59,6 +60,7 @@ class TexturedDome:
     curve: float = 0.0
     turns_at_zoom: bool = False
     obeys: bool = True
+    cap_deg_s: float = 100.0
     t: float = 10.0
 
     def __post_init__(self):
@@ -145,7 +147,9 @@ class _Head:
         for axis, goal, k, rate in zip(rig.axes, (pan, tilt), rig.scale, self.limits.capped(speed), strict=True):
             goal = round(goal / step) * step if step else goal
             if rig.obeys:
-                axis.command(rig.t + rig.delay_s, k * goal, abs(k) * rate)
+                zoomed = rig.zooms[-1][1] > WIDE_PX * LONGEST**0.5
+                fastest = math.radians(rig.cap_deg_s if zoomed else 100.0)
+                axis.command(rig.t + rig.delay_s, k * goal, min(abs(k) * rate, fastest))
         return pan, tilt
 
     def halt(self):
