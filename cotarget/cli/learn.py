@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from cotarget.drivers.ptz import PtzSettings
     from cotarget.rig import Rig
 
-# The picture shows scales to 1 % and the focal length to 4 %. What rig.toml has stays where it is as near: it is from
-# the data sheet.
-SAME_SCALE, SAME_FOCAL = 0.015, 0.05
+# The picture shows scales to 1 %, to 2 % where it has 320 px, and the focal length to 4 %. What rig.toml has stays where
+# it is as near: it is from the data sheet.
+SAME_SCALE, SAME_FOCAL, SCALE_PX = 0.015, 0.05, 640
 SURE_DEG = 0.2  # rms angle beyond which positions are not where the picture shows
 SHARE = 1.3  # of the largest distance from the goal that was seen: the next may be larger
 USUAL_DELAY_S = 0.05  # from a command to motion, where it is not seen apart from the picture's delay
@@ -78,7 +78,8 @@ def _keys(settings: "PtzSettings", learnt: "Learnt", rig: "Rig") -> dict[str, An
     """List the keys of rig.toml that are to change."""
     keys: dict[str, Any] = {}
     scales = [abs(scale) for scale in learnt.scale]
-    same = [abs(scale - 1) <= SAME_SCALE for scale in scales]
+    nearest = SAME_SCALE * max(SCALE_PX / settings.size[0], 1.0)
+    same = [abs(scale - 1) <= nearest for scale in scales]
     counted = all(settings.steps_deg)
     if counted and not all(same):
         steps = [step if as_is else step * k for step, as_is, k in zip(settings.steps_deg, same, scales, strict=True)]
@@ -151,7 +152,7 @@ def _words(settings: "PtzSettings", learnt: "Learnt", keys: dict[str, Any]) -> I
         yield f"Its picture is {learnt.orientation}, against the fixed camera's: set it upright in the dome's page."
     for name, scale in zip(("pan", "tilt"), learnt.scale, strict=True):
         way = " the other way" if scale < 0 else ""
-        yield f"A degree of {name} by rig.toml is {abs(scale):.3f} degrees{way}, by the picture, to 1 %."
+        yield f"A degree of {name} by rig.toml is {abs(scale):.3f} degrees{way}, by the picture."
     if learnt.off_deg > SURE_DEG:
         yield f"Its positions cannot be believed: they are {learnt.off_deg:.1f} degrees (rms) off the picture."
     if learnt.both_axes:
