@@ -255,7 +255,7 @@ def _beside_films(settings: PageSettings, browser: Browser) -> list[Row]:
             rows += _orders(browser, taps, settings.orders)
             browser.open("about:blank")
             rows += _turns(browser, operated, settings.block_s)
-            return rows + (_soak(browser, operated, sent, settings.soak_s) if settings.soak_s else [])
+            return rows + (_soak(browser, operated, taps, sent, settings.soak_s) if settings.soak_s else [])
 
         return _operate(rig, calibration_of(SIZE), target, act, Path(folder))
 
@@ -429,7 +429,9 @@ async def _read(socket: Any) -> None:
 # A long run
 
 
-def _soak(browser: Browser, operated: Operated, sent: Sequence[float], seconds: float) -> list[Row]:
+def _soak(
+    browser: Browser, operated: Operated, taps: Sequence[Tap], sent: Sequence[float], seconds: float
+) -> list[Row]:
     """Follow for long with the page open; give the frames that are not accounted for, and the growth of memory."""
     _open_and_follow(browser, operated.page.link)
     time.sleep(SETTLED_S)
@@ -437,6 +439,9 @@ def _soak(browser: Browser, operated: Operated, sent: Sequence[float], seconds: 
     first, first_t = operated.accounted, operated.newest_t
     for _ in range(round(seconds)):
         time.sleep(1.0)
+        operated.turns.clear()  # what is noted here is no growth of the program
+        for tap in taps:
+            tap.written.clear()
         resident.append(int(Path("/proc/self/statm").read_text().split()[1]))
         assert browser.js("performance.now() - drawnAt < 2000"), "the page shows no new pictures"
     last, last_t = operated.accounted, operated.newest_t
