@@ -21,6 +21,7 @@ from cotarget.config import Polygon, TargetProfile
 from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
 from cotarget.control.orders import HOME, MANUAL_S, Order
+from cotarget.control.policy import OnnxPolicy
 from cotarget.control.selection import Chosen, FirstCome, TargetSelector, candidates_of
 from cotarget.control.zoom import ZoomSettings, is_seen_well
 from cotarget.detection import Detections, Detector, make_detector
@@ -275,6 +276,8 @@ class FollowSettings:
         matching: registration in the zoom image.
         head: deadband and speed of the head.
         zoom: choice of the focal length.
+        policy: a learnt policy, which drives head and lens while the target is seen; `head` and `zoom` then count while
+            it is not.
     """
 
     predict: bool = True
@@ -287,6 +290,7 @@ class FollowSettings:
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     head: HeadSettings = field(default_factory=HeadSettings)
     zoom: ZoomSettings = field(default_factory=ZoomSettings)
+    policy: OnnxPolicy | None = None
 
 
 @dataclass(frozen=True)
@@ -486,7 +490,14 @@ class HeadRun:
             matching=settings.matching,
             settings=settings.fusion,
         )
-        self.controller = Controller(rig, calibration, head=settings.head, zoom=settings.zoom, predict=settings.predict)
+        self.controller = Controller(
+            rig,
+            calibration,
+            head=settings.head,
+            zoom=settings.zoom,
+            predict=settings.predict,
+            policy=settings.policy,
+        )
         selector.start(rig.fixed.size)
 
     def read_states(self) -> None:

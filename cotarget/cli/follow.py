@@ -19,6 +19,7 @@ from cotarget.cli.common import (
 )
 from cotarget.cli.page_run import PageRun, Recordings, add_page, check_page, demo_config, is_demo
 from cotarget.cli.pipeline_run import (
+    LEARNT,
     RunInputs,
     Selection,
     add_outputs,
@@ -31,6 +32,7 @@ from cotarget.errors import ConfigError, choices, naming
 
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
+    from cotarget.pipeline import FollowSettings
     from cotarget.rig import Rig, RigSpec
 
 CALIBRATION = "calibration.json"  # beside rig.toml
@@ -43,7 +45,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_file(parser, "--calibration", about)
     about = "a target of rig.toml (that of [follow], or the only one of a simulated scene)"
     parser.add_argument("--target", metavar="NAME", help=about)
-    add_selection(parser)
+    add_selection(parser, learnt=True)
     parser.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
     add_outputs(parser)
     add_file(parser, "--record", "record everything, for cotarget replay", "DIR")
@@ -91,6 +93,7 @@ def _run(options: argparse.Namespace, opened_first: ExitStack) -> int:
     calibration = Calibration.load(file)
     check_outputs(output_files(options), [*rig_files(options.rig, config), file], options.record)
     check_run(calibration, spec, target, name, insist=options.insist, files=(file, options.rig))
+    settings = _settings(options)
     selection, rate_hz = Selection(options, spec.fixed.size), spec.fixed.rate_hz
     seconds = math.inf if options.seconds is None else options.seconds
 
@@ -98,7 +101,7 @@ def _run(options: argparse.Namespace, opened_first: ExitStack) -> int:
         return Recorder(folder, config, file, name, selection.selector)
 
     def make_run(rig: "Rig") -> Run:
-        return Run(rig, calibration, target, selector=Selection(options, spec.fixed.size).selector)
+        return Run(rig, calibration, target, selector=Selection(options, spec.fixed.size).selector, settings=settings)
 
     records = None if page is None else opened_first.enter_context(Recordings(options.record, make_recorder))
     with make_recorder(options.record) if options.record and page is None else nullcontext() as recorder:
@@ -111,7 +114,18 @@ def _run(options: argparse.Namespace, opened_first: ExitStack) -> int:
 
         expected = None if math.isinf(seconds) else math.ceil(seconds * rate_hz)
         operated = None if page is None or records is None else page.operated(records, make_run, seconds)
-        run = RunInputs(opened, config, calibration, name, rate_hz, selection, seconds, expected, operated=operated)
+        run = RunInputs(
+            opened,
+            config,
+            calibration,
+            name,
+            rate_hz,
+            selection,
+            seconds,
+            expected,
+            operated=operated,
+            settings=settings,
+        )
         result = run_observed(run, options)
         if result.interrupt is None:  # a run cut short may not have had the time to see anything
             warn_if_unseen("follow", run, result.counts)
@@ -119,6 +133,18 @@ def _run(options: argparse.Namespace, opened_first: ExitStack) -> int:
         if result.interrupt is not None:
             raise result.interrupt
     return result.counts.exit_status if page is None else 0
+
+
+def _settings(options: argparse.Namespace) -> "FollowSettings":
+    """Make the settings with the learnt policy that --policy names, if it does; the first target is then followed."""
+    from cotarget.control.policy import OnnxPolicy
+    from cotarget.pipeline import FollowSettings
+
+    if options.policy is None or not options.policy.endswith(LEARNT):
+        return FollowSettings()
+    file, options.policy = Path(options.policy), None
+    with naming("--policy"):
+        return FollowSettings(policy=OnnxPolicy(file))
 
 
 def _demo_rig(config: "RigConfig", opened_first: ExitStack) -> "tuple[Rig, Path]":

@@ -24,7 +24,7 @@ from cotarget.parallel import progress_bar
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig, TargetProfile
-    from cotarget.pipeline import Run, Step
+    from cotarget.pipeline import FollowSettings, Run, Step
     from cotarget.recording.replay import Replay
     from cotarget.rig import Rig
 
@@ -58,6 +58,7 @@ class RunInputs:
         expected: number of steps; None if it is unknown.
         replay: the recording that is replayed; None for a rig.
         operated: yields the steps of a run that an operator gives orders; None for a run without one.
+        settings: settings of the run; the usual ones by default.
     """
 
     open_rig: "Callable[[], Rig]"
@@ -70,6 +71,7 @@ class RunInputs:
     expected: int | None
     replay: "Replay | None" = None
     operated: "Callable[[Rig, Run], Iterator[Step]] | None" = None
+    settings: "FollowSettings | None" = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +134,7 @@ def run_observed(run: RunInputs, options: argparse.Namespace, *more: Observer) -
 
             def steps() -> "Iterator[Step]":  # a recording may end before the first step
                 selector = run.selection.selector
-                made = Run(rig, run.calibration, target, detector, selector=selector)
+                made = Run(rig, run.calibration, target, detector, selector=selector, settings=run.settings)
                 yield from made.follow(run.seconds) if run.operated is None else run.operated(rig, made)
 
             try:
@@ -361,14 +363,31 @@ class Reasons:
 POLICIES = ("first-come", "nearest-deadline", "most-served")
 
 
-def add_selection(parser: argparse.ArgumentParser, default: str = POLICIES[0]) -> None:
-    """Add the options that select the target to follow; the help names the default."""
+LEARNT = ".onnx"  # ending of a learnt policy's file
+
+
+class PolicyNames(tuple[str, ...]):
+    """Names of policies; files of learnt policies are valid too."""
+
+    def __contains__(self, given: object) -> bool:
+        return super().__contains__(given) or str(given).endswith(LEARNT)
+
+
+def add_selection(parser: argparse.ArgumentParser, default: str = POLICIES[0], *, learnt: bool = False) -> None:
+    """Add the options that select the target to follow; the help names the default.
+
+    Args:
+        parser: parser of the command.
+        default: what holds without an option.
+        learnt: whether the file of a learnt policy may stand for a policy.
+    """
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--policy",
-        choices=POLICIES,
+        choices=PolicyNames(POLICIES) if learnt else POLICIES,
         help="choice among several targets: the first until it disappears, the one that leaves first, or the order "
-        f"that gives most of them a good close-up ({default})",
+        f"that gives most of them a good close-up ({default})"
+        + ("; or FILE.onnx, a learnt policy, which drives head and lens after the first" if learnt else ""),
     )
     which.add_argument(
         "--click",

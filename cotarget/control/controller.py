@@ -12,6 +12,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.control.head import HeadController, HeadSettings
+from cotarget.control.policy import OnnxPolicy, Situation, ahead_s, rates_of, task_features, zoomed
 from cotarget.control.zoom import ZoomController, ZoomSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
@@ -31,6 +32,7 @@ class Controller:
         head: settings of the head controller.
         zoom: settings of the zoom controller.
         predict: whether to predict the target's motion; without it the head goes to where the target was seen.
+        policy: a learnt policy, which drives head and lens in place of the two controllers.
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class Controller:
         head: HeadSettings | None = None,
         zoom: ZoomSettings | None = None,
         predict: bool = True,
+        policy: OnnxPolicy | None = None,
     ) -> None:
         head = head or HeadSettings()
         self._rig, self._calibration, self._predict = rig, calibration, predict
@@ -51,6 +54,9 @@ class Controller:
         state = rig.head.state()
         self.commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
         self.head_commands, self.lens_commands = 0, 1  # number sent so far
+        self._policy = policy
+        # Logarithm of the focal length that the policy wants, and what the lens made of it.
+        self._wanted_focal, self._zoomed_px = 0.0, math.nan
 
     def drive(self, predict: Predict, seen_t: float, interval: float, *, shape: float = 1.0) -> tuple[Aim, str]:
         """Send head and lens after a target.
@@ -70,6 +76,9 @@ class Controller:
         """
         effect_t, target, later = self._predict_over_lead(predict, seen_t, interval)
         first, then = self._aims(target, later)
+        if self._policy is not None:
+            self._obey(self._policy, effect_t, first, then, seen_t, interval)
+            return first, "wanted"
         self._command_head(effect_t, target, first, then, interval)
         pan, tilt, focal = self.commanded
         now = self._rig.clock.now()
@@ -90,6 +99,31 @@ class Controller:
             self.lens_commands += 1
         self.commanded = (pan, tilt, focal)
         return first, reason
+
+    def _obey(self, policy: OnnxPolicy, effect_t: float, first: Aim, then: Aim, seen_t: float, interval: float) -> None:
+        """Send head and lens as a learnt policy wants; arguments as for `_command_head`, and when it was last seen."""
+        rig, limits, (shortest, longest) = self._rig, self._rig.head.limits, self._rig.zoom.focal_range
+        if self.commanded[2] != self._zoomed_px:  # something else has zoomed
+            self._wanted_focal = math.log(self.commanded[2])
+        motion, nominal_px = np.array(self._head_controller.head.motion_at(effect_t)), rig.zoom.state().focal_px
+        half_width = np.array(rig.zoom.size[0] / 2 / self._true(nominal_px))
+        focal, focal_then = math.log(first.nominal_px), math.log(first.nominal_px * then.range / first.range)
+        ranges = limits.pan.range, limits.tilt.range, (math.log(shortest), math.log(longest))
+        aim_now = (first.pan, first.tilt, focal)
+        absolute = [2 * (at - low) / (high - low) - 1 for at, (low, high) in zip(aim_now, ranges, strict=True)]
+        unseen_s = max(rig.clock.now() - rig.spec.fixed.latency_s - seen_t, 0.0)
+        logs = np.log([self.commanded[2], nominal_px])
+        situation = Situation(motion[:, 0], motion[:, 1], logs[0], logs[1], half_width, interval)
+        aims = np.array(aim_now), np.array([then.pan, then.tilt, focal_then])
+        features = task_features(*aims, np.array(absolute), np.array(1.0), np.array(unseen_s), situation)
+        action = policy.rates(features)
+        pan, tilt = rates_of(action, half_width, interval).tolist()
+        command = self._head_controller.turn(effect_t, (pan, tilt), ahead_s(limits, interval))
+        self._move(command.pan, command.tilt, command.speed)
+        self._wanted_focal = float(zoomed(action, self._wanted_focal, shortest, longest))
+        self._zoomed_px = rig.zoom.zoom(math.exp(self._wanted_focal))
+        self.lens_commands += self._zoomed_px != self.commanded[2]
+        self.commanded = (*self.commanded[:2], self._zoomed_px)
 
     def search(self, predict: Predict, seen_t: float, interval: float) -> Aim | None:
         """Zoom out, and point the head where a target out of sight should be.

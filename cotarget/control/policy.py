@@ -9,12 +9,14 @@ The functions work on one rig, or on many at once along the last axis.
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cotarget.control.head import HeadSettings
+from cotarget.errors import ConfigError, install_extra
 from cotarget.geometry import Array
 from cotarget.rig import PanTiltLimits
 
@@ -23,6 +25,7 @@ FARTHEST = 5.0  # offset beyond which a feature is clipped: the head is then at 
 FASTEST = 4.0  # the same for speeds [half-widths a frame]
 ZOOMED = 4.0  # the same for logarithms of focal lengths
 LONGEST_UNSEEN_S = 1.0
+LONGEST_REASON = 200  # of what onnxruntime says of a file [characters]
 
 # Features of the task with their ranges. Offsets, rates and the command are 0 without a confirmed track.
 TASK_FEATURES = {
@@ -135,3 +138,63 @@ def ahead_s(limits: PanTiltLimits, interval: float) -> float:
     if any(math.isinf(axis.speed) for axis in limits.axes):
         return interval
     return max(HeadSettings.ahead_s, HeadSettings.frames_ahead * interval)
+
+
+ENVIRONMENT = "cotarget/Follow-v1"
+FILE_ACTIONS = ("rates", "residual")  # actions that a policy's file may have
+
+
+class OnnxPolicy:
+    """A learnt policy as an ONNX file, from TASK_FEATURES to actions.
+
+    The file has one input (n, 14) and one output (n, 3), both float32, its normalisation inside, and the metadata
+    `environment` and `action`.
+
+    Attributes:
+        path: the file.
+        action: what its actions mean, "rates" or "residual".
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Load a file and run it once.
+
+        Raises:
+            ConfigError: there is no such file, it is no such policy, or onnxruntime is not installed.
+        """
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such file; give a policy as an ONNX file")
+        try:
+            import onnxruntime  # type: ignore[import-untyped,unused-ignore]
+        except ImportError:
+            raise ConfigError(f"{path}: needs onnxruntime: {install_extra('onnx')}") from None
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # the network is small
+        options.log_severity_level = 4  # errors are raised as well
+        try:
+            self._session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        except Exception as error:
+            raise ConfigError(f"{path}: is no ONNX file: {' '.join(str(error).split())[:LONGEST_REASON]}") from None
+        about = self._session.get_modelmeta().custom_metadata_map
+        self.path, self.action = path, about.get("action", "")
+        if about.get("environment") != ENVIRONMENT or self.action not in FILE_ACTIONS:
+            raise ConfigError(
+                f"{path}: is no policy of {ENVIRONMENT}: its metadata need environment = {ENVIRONMENT} and action = "
+                f"{' or '.join(FILE_ACTIONS)}, as experiments.learning.train writes them"
+            )
+        try:
+            fits = self(np.zeros(len(TASK_FEATURES))).shape == (3,)
+        except Exception:
+            fits = False
+        if not fits:
+            raise ConfigError(f"{path}: does not turn {len(TASK_FEATURES)} features into 3 numbers, in float32")
+
+    def __call__(self, features: Numbers) -> Numbers:
+        """Give the actions (..., 3) of features (..., 14)."""
+        rows = np.asarray(features, np.float32).reshape(-1, len(TASK_FEATURES))
+        (found,) = self._session.run(None, {self._session.get_inputs()[0].name: rows})
+        return np.asarray(found).reshape(*np.shape(features)[:-1], -1)
+
+    def rates(self, features: Numbers) -> Numbers:
+        """Give actions "rates" for features."""
+        action = self(features)
+        return moved_aim(features, action) if self.action == "residual" else action

@@ -29,6 +29,7 @@ from cotarget.tracking.track import Track
 from cotarget.video import Film
 from experiments.calibration.synthetic.rig import Truth, undistorted
 from experiments.engine import LINEAR_ALGEBRA
+from experiments.learning.onnx_policy import write_policy
 from tests.support.commands import OLD, bird_film, call, refused, true_calibration, write_index
 from tests.support.rigs import alike
 from tests.support.synthetic_rig import draw, pixel_rays
@@ -237,6 +238,18 @@ def test_follow_needs_no_option_in_the_folder_of_a_rig(folder, capsys, calibrati
     (folder / "rig.toml").write_text(f'[sim]\nscene = "indoor"\ntargets = {json.dumps(scene)}\n{table}')
     status, out, err = call(capsys, "follow", "--seconds", "0.3")  # without it, to Ctrl-C
     assert (status, err, json.loads(out)["steps"] >= 6) == (0, "", True)
+
+
+@pytest.mark.render
+def test_follow_takes_a_learnt_policy_as_a_file(folder, capsys):
+    pytest.importorskip("onnxruntime", reason="runs policies")
+    pytest.importorskip("onnx", reason="writes policies")
+    still = np.zeros((3, 14), np.float32), np.zeros(3, np.float32)
+    write_policy(folder / "still.onnx", [still], np.zeros(14), np.ones(14), 10.0, "rates")
+    status, out, err = call(capsys, *FOLLOW, "--seconds", "0.3", "--policy", "still.onnx")
+    assert (status, err, json.loads(out)["steps"] >= 6) == (0, "", True)
+    said = refused(capsys, *FOLLOW, "--policy", "none.onnx")
+    assert said == "cotarget follow: --policy: none.onnx: no such file; give a policy as an ONNX file"
 
 
 def test_detect_writes_a_table(folder, capsys):

@@ -52,6 +52,12 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
 
     Paths and sizes are drawn from some that are prepared when they are first met; noise, misses and variations are new
     in each episode. The first frame of an episode is not detected.
+
+    Attributes:
+        config: the rig.
+        target: profile of the target.
+        single: a single environment with the same arguments.
+        frames: number of steps of an episode.
     """
 
     def __init__(
@@ -99,7 +105,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         self.single = FollowV1(
             target, action, reward, "tracks", gamma, randomize, rig, calibration, seconds, noise=noise
         )
-        self.num_envs, self._noise = num_envs, noise
+        self.num_envs, self._noise, self.frames = num_envs, noise, self.single.frames
         self.config, self.target = self.single.config, self.single.target
         self.single_action_space, self.single_observation_space = (
             self.single.action_space,
@@ -108,6 +114,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         batch_space = gymnasium.vector.utils.batch_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.render_mode = None
         self.metadata = {
             "autoreset_mode": AutoresetMode.SAME_STEP,
             "render_modes": [],
@@ -216,7 +223,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         seen = self._closeups(self._driven, shown[LENS], slice(None))
         reward = self._rewards(seen, self._zoom_k > zoom_before)
         self._features = self._observe(now, present[LENS])
-        truncated = self._k >= self.single.frames
+        truncated = self._k >= self.frames
         infos = {"good": seen.good, "_good": np.ones(self.num_envs, bool)}
         if truncated.any():
             infos |= {"final_obs": self._features.copy(), "_final_obs": truncated}
