@@ -122,7 +122,7 @@ def test_experiments_and_their_options_exist():
         main(["--help"])
     for module, rest in EXPERIMENTS:
         if module:
-            assert module.rpartition(".")[2] in {*known_names, "gallery", "teaser", EXAMPLE}
+            assert module.rpartition(".")[2] in {*known_names, "gallery", "teaser", "train", "score", EXAMPLE}
             continue
         for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest):
             assert option in said.getvalue(), f"python -m experiments {option}"
