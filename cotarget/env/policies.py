@@ -21,6 +21,7 @@ from cotarget.control.selection import POLICIES
 from cotarget.detection import Detections
 from cotarget.env.common import Command, Episode, Vector, one_of
 from cotarget.env.follow import Follow
+from cotarget.env.follow_v1 import FollowV1
 from cotarget.env.schedule import Schedule
 from cotarget.errors import ConfigError
 from cotarget.pipeline import FollowSettings, Step, follow
@@ -141,7 +142,7 @@ class EnvironmentHead:
 
 
 class PipelinePolicy:
-    """Use `cotarget.pipeline.follow` as a policy of `cotarget/Follow-v0`, with the fixed camera alone."""
+    """Use `cotarget.pipeline.follow` as a policy of Follow, with the fixed camera alone and with absolute actions."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         """Create the policy.
@@ -154,6 +155,8 @@ class PipelinePolicy:
         """
         if not isinstance(env.unwrapped, Follow):
             raise ConfigError(f"env: the pipeline is a policy of cotarget/Follow-v0, and not of {env.unwrapped}")
+        if isinstance(env.unwrapped, FollowV1) and env.unwrapped.action != "absolute":
+            raise ConfigError(f"env: the pipeline's actions are 'absolute', and not '{env.unwrapped.action}'")
         self._env = env.unwrapped
         self._episode: Episode | None = None
         self._seen: Frame | None = None

@@ -240,6 +240,7 @@ def test_a_target_and_a_rig_of_ones_own_by_rig_toml(tmp_path):
     (lambda: FollowV1(gamma=1.5), "gamma: 1.5"),
     (lambda: FollowV1(randomize=3), "randomize: 3"),
     (lambda: FollowV1(randomize=Randomization(delay=-1.0)), "randomize.delay: -1.0"),
+    (lambda: PipelinePolicy(FollowV1()), "env: the pipeline's actions are 'absolute'"),
     (lambda: FollowV1().reset(options={"wind": 3}), "options: {'wind': 3}"),
     (lambda: FollowV1().reset(options={"delay": 0}), "options.delay: 0"),
     (lambda: FollowV1().reset(options={"x_m": math.nan}), "options.x_m: nan"),
