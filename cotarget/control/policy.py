@@ -97,7 +97,8 @@ def task_features(
     return np.minimum(np.maximum(found.astype(np.float32), LOWEST), HIGHEST)
 
 
-GAIN = 0.25  # part of the offset that the proportional controller corrects in a frame
+# Part of the offset that the proportional controller corrects in a frame; the comparison: docs/design-notes.md.
+GAIN = 0.25
 
 
 def proportional(features: Numbers) -> Array:
