@@ -14,7 +14,7 @@ Layer = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]  # weights (out,
 def write_policy(
     path: Path, layers: Sequence[Layer], mean: npt.ArrayLike, scale: npt.ArrayLike, clip: float, action: str
 ) -> None:
-    """Write a network with tanh between its layers.
+    """Write a network with tanh between its layers, whose actions are 0 without a confirmed track.
 
     Args:
         path: file to write.
@@ -45,7 +45,11 @@ def write_policy(
         inputs = [value, constant(f"weights{i}", weights), constant(f"biases{i}", biases)]
         value = node("Gemm", inputs, f"layer{i}", transB=1)
         value = value if last else node("Tanh", [value], f"tanh{i}")
-    node("Clip", [value, constant("lowest", -1.0), constant("highest", 1.0)], "action")
+    value = node("Clip", [value, constant("lowest", -1.0), constant("highest", 1.0)], "bounded")
+    only_known = np.zeros((3, len(TASK_FEATURES)))
+    only_known[:, list(TASK_FEATURES).index("known")] = 1.0
+    known = node("Gemm", ["features", constant("only_known", only_known)], "known", transB=1)
+    node("Mul", [value, known], "action")
     ends = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", size])
         for name, size in (("features", len(TASK_FEATURES)), ("action", 3))

@@ -2,6 +2,9 @@
 
 Both reset in the step that ends an episode. Stable-Baselines3 wants the last observation of that episode in the infos,
 as `terminal_observation`, and `TimeLimit.truncated` where it bootstraps.
+
+Head and lens wait without a confirmed track, as in `cotarget follow`, which asks no policy then. Otherwise a policy
+learns to turn at random before its target comes into view.
 """
 
 from collections.abc import Sequence
@@ -10,7 +13,10 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from cotarget.control.policy import TASK_FEATURES
 from cotarget.env.batch import FollowBatch
+
+KNOWN = [list(TASK_FEATURES).index("known")]
 
 
 class BatchVecEnv(VecEnv):  # type: ignore[misc]
@@ -35,6 +41,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         observation, _ = self.batch.reset(seed=self._wanted_seed)
         self._wanted_seed = None
         self._sum[:] = 0.0
+        self._known = observation[:, KNOWN]
         return observation
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
@@ -48,7 +55,8 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
 
     def step_wait(self) -> Any:
         """Carry out the stored actions."""
-        observation, rewards, terminated, truncated, found = self.batch.step(self._actions)
+        observation, rewards, terminated, truncated, found = self.batch.step(self._actions * self._known)
+        self._known = observation[:, KNOWN]
         over = terminated | truncated
         self._sum += found["good"]
         infos = self._empty

@@ -44,11 +44,13 @@ def test_a_file_holds_the_normalisation_and_the_network(tmp_path):
     rng = np.random.default_rng(0)
     layers = [(rng.normal(size=(5, COUNT)), rng.normal(size=5)), (rng.normal(size=(3, 5)), rng.normal(size=3))]
     policy, features = write(tmp_path / "a.onnx", layers, 0.3, 2.0), rng.normal(size=(7, COUNT))
+    features[:, 0] = 1.0  # known
     hidden = np.tanh(np.clip((features - 0.3) * 2.0, -10, 10) @ layers[0][0].T + layers[0][1])
     wanted = np.clip(hidden @ layers[1][0].T + layers[1][1], -1, 1)
     np.testing.assert_allclose(policy(features), wanted, atol=ROUNDING)
     np.testing.assert_allclose(policy(features[0]), wanted[0], atol=ROUNDING)  # one rig
     np.testing.assert_array_equal(policy.rates(features), policy(features))
+    assert not policy(features * ([0.0] + [1.0] * (COUNT - 1))).any()  # without a track it waits
     residual = write(tmp_path / "b.onnx", layers, 0.3, 2.0, "residual")
     np.testing.assert_allclose(residual.rates(features), moved_aim(features, wanted), atol=ROUNDING)
 
@@ -63,14 +65,20 @@ def test_wrong_files_are_refused_in_one_line(tmp_path):
         with pytest.raises(ConfigError, match=said) as caught:
             OnnxPolicy(tmp_path / name)
         assert "\n" not in str(caught.value)
-    with pytest.raises(ConfigError, match="features into 3"):
-        write(tmp_path / "wide.onnx", [(np.zeros((4, COUNT)), np.zeros(4))])
+    ends = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["n", COUNT]) for name in ("in", "out")]
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Identity", ["in"], ["out"])], "same", ends[:1], ends[1:])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    onnx.helper.set_model_props(model, {"environment": "cotarget/Follow-v1", "action": "rates"})
+    onnx.save(model, tmp_path / "same.onnx")
+    with pytest.raises(ConfigError, match="14 features into 3 numbers"):
+        OnnxPolicy(tmp_path / "same.onnx")
 
 
 def test_a_policy_follows_a_bird_within_the_soft_limits(tmp_path):
     """The proportional controller as a file, behind the guard, with limits that a part of the path is beyond."""
     policy = write(tmp_path / "policy.onnx", proportional_layer())
     features = np.random.default_rng(1).uniform(-1, 1, (9, COUNT)).astype(np.float32)
+    features[:, 0] = 1.0  # known
     np.testing.assert_allclose(policy(features), proportional(features), atol=ROUNDING)
     good, pans = [], []
     for limit_deg in (90.0, 5.0):

@@ -14,10 +14,11 @@ def test_the_batch_is_a_vector_environment_of_stable_baselines3(tmp_path):
     batch, env = FollowBatch(3, **arguments), BatchVecEnv(FollowBatch(3, **arguments))
     env.seed(5)
     np.testing.assert_array_equal(env.reset(), batch.reset(seed=5)[0])
-    rng = np.random.default_rng(0)
+    rng, known = np.random.default_rng(0), np.zeros((3, 1))
     for k in range(1, 25):
         actions = rng.uniform(-1, 1, (3, 3)).astype(np.float32)
-        observation, rewards, _, truncated, infos = batch.step(actions)
+        observation, rewards, _, truncated, infos = batch.step(actions * known)  # it waits for a track
+        known = observation[:, :1]
         found, earned, over, told = env.step(actions)
         np.testing.assert_array_equal(found, observation)
         np.testing.assert_allclose(earned, rewards, rtol=1e-6)
@@ -26,7 +27,7 @@ def test_the_batch_is_a_vector_environment_of_stable_baselines3(tmp_path):
             assert info.get("TimeLimit.truncated", False) == (k % 10 == 0)
             if over[i]:
                 np.testing.assert_array_equal(info["terminal_observation"], infos["final_obs"][i])
-                assert info["terminal_observation"].any()
+                assert info["terminal_observation"][0] == 1.0
                 assert not found[i].any()  # the first observation of the next episode
     env.close()
 
@@ -48,6 +49,7 @@ def test_ppo_learns_from_the_batch_and_its_file_acts_as_its_network(tmp_path):
     model.learn(512)
     export(model, env, tmp_path / "policy.onnx", "rates")
     features = env.get_original_obs()
+    features[:, 0] = 1.0  # known
     wanted, _ = model.predict(env.normalize_obs(features), deterministic=True)
     np.testing.assert_allclose(OnnxPolicy(tmp_path / "policy.onnx")(features), wanted, atol=1e-5)
     env.close()
