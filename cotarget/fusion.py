@@ -159,6 +159,16 @@ class ZoomSearch:
             self.clock.forget_target()
             self.finder, self.unfound_s, self._sizes = self._make_finder(), 0.0, SizeHistory(BEAT_S)
 
+    def correct_clock(self) -> float:
+        """Return what the next fixed frame's stamp has too much [s].
+
+        With another correction the target's filter begins anew by the fixed camera: a depth by wrong times stays.
+        """
+        late_s = self.clock.correct()
+        if self.clock.begins_anew() and self.target is not None and self.target.filter is not None:
+            self.target.filter = self.target.filter.alone()
+        return late_s
+
     def add_frame(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
         """Find the followed target in the zoom image, and correct its 3D state by the offset found there.
 
@@ -200,7 +210,7 @@ class ZoomSearch:
                 pose.nominal_px,
                 due.t,
                 head_sigma=head_sigma,
-                time_sigma_s=self.clock.sigma_s,
+                time_sigma_s=self.clock.uncorrected_s,
                 size=self._size(due, found, seen, estimate.target),
             )
             self.clock.add(target.filter.observations)

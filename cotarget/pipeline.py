@@ -681,7 +681,7 @@ class Run:
         """Process one frame of the fixed camera, in the order of the paper's Table 1."""
         frames, head = self._frames, self.head
         shown = frames.read_fixed()
-        frame = replace(shown, t=shown.t - head.search.clock.correct())
+        frame = replace(shown, t=shown.t - head.search.correct_clock())
         detections, tracks = self.camera.track(frame), self.camera.tracks
         favoured = {track.id for track in tracks if head.selector.favours(track)}
         self.fusion.add_shift(detections.shift, cut=detections.cut)

@@ -43,6 +43,7 @@ class ClockOffset:
         self._gained = np.diag(gained)  # variances in a second
         self._t = -math.inf  # of the last zoom frame [s]
         self.corrected_s = 0.0
+        self._begun_s = 0.0  # correction when the target filters last began anew [s]
 
     @property
     def late_s(self) -> float:
@@ -53,6 +54,14 @@ class ClockOffset:
     def sigma_s(self) -> float:
         """Standard deviation of that [s]."""
         return math.sqrt(float(self._P[OFFSET, OFFSET]))
+
+    @property
+    def uncorrected_s(self) -> float:
+        """Part of the offset that is not corrected, beyond one standard deviation [s].
+
+        It is corrected once it is sure, and step by step.
+        """
+        return max(abs(self.late_s - self.corrected_s) - self.sigma_s, 0.0)
 
     def forget_target(self) -> None:
         """Go on with another target, whose size is unknown; the clocks stay."""
@@ -68,6 +77,13 @@ class ClockOffset:
         goal_s = self.late_s if abs(self.late_s) > max(3 * self.sigma_s, LEAST_S) else 0.0
         self.corrected_s += min(max(goal_s - self.corrected_s, -SLEW_S), SLEW_S)
         return self.corrected_s
+
+    def begins_anew(self) -> bool:
+        """Whether the correction has come to another value, so that what came before it was fused wrongly; once."""
+        is_new = abs(self.corrected_s - self._begun_s) > 2 * LEAST_S and self.uncorrected_s == 0
+        if is_new:
+            self._begun_s = self.corrected_s
+        return is_new
 
     def add(self, observed: Sequence[Observation]) -> None:
         """Add the new zoom frames of a target that the fixed camera shows before and after.

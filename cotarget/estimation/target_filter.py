@@ -418,6 +418,14 @@ class TargetFilter:
         """Observations of the last `history_s`, in the order of time."""
         return self._observed
 
+    def alone(self) -> "TargetFilter":
+        """Filter the same target anew, by what the fixed camera has shown in the last `history_s`."""
+        fixed = TargetFilter(self._calibration, self._target, self._settings)
+        for each in self._observed:
+            if each.sight is None:
+                fixed._insert(each)
+        return fixed
+
     def estimate(self, t: float) -> Estimate | None:
         """Estimate the target at a time [s], after the newest measurement or up to `history_s` before it.
 

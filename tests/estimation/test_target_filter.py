@@ -144,6 +144,18 @@ def test_the_zoom_cameras_size_outweighs_a_part_in_the_fixed_image():
     assert ends[1] == pytest.approx(flight.size, rel=BY_OUTLINES)
 
 
+def test_a_filter_begun_anew_by_the_fixed_camera_is_one_that_saw_no_zoom_image():
+    flight = Flight("person", 300, 1.2)
+    both, fixed = (TargetFilter(flight.calibration, flight.target) for _ in range(2))
+    for t in flight.times:
+        box, view = flight.wide(t), flight.zoom(t + APART)
+        for each in (both, fixed):
+            assert each.add_fixed(box, t)
+        assert show(both, view)
+    assert both.alone().estimate(t).state == pytest.approx(fixed.estimate(t).state, rel=SAME)
+    assert both.estimate(t).depth != fixed.estimate(t).depth
+
+
 def test_the_targets_motion_decides_how_it_is_predicted_whatever_its_matcher():
     """A red drone is predicted better as something that flies than as something that stands."""
     misses = {}
