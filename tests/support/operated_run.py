@@ -4,6 +4,7 @@ import math
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
 
@@ -46,6 +47,8 @@ class Wall:
         return self.t
 
 
+# A busy machine may not look at the stop file for longer than a run allows.
+@patch("cotarget.safety.stop_file.MOST_MISSED", 200)
 def operate(path, steps, act, *, folder=None, stop_file=None, config=None, devices=None, guard_file=None):
     """Run some steps; `act(i, session, wall, rig)` is called after step i. The steps."""
     devices = devices or ToyDevices()
