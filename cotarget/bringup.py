@@ -44,6 +44,7 @@ LENS_STANDS_S = 0.8  # longest delay of a picture, after the lens has come to re
 STILL_PX, STILL_S = 0.25, 0.5  # the picture stands if its corners move by no more from frame to frame for so long
 UNMOVED_S = 3.0  # a picture that has not moved for so long after a command does not move [s]
 BACK_S = 5.0  # longest time without a frame [s]
+RESTLESS_S = 15.0  # longest time on the way to a place [s]
 SLOWEST_S = 60.0  # longest time to wait for a picture that stands [s]
 CORNERS, WEAKEST, APART_PX = 200, 0.01, 8
 # Where the dome looks: parts of the field of view from the middle; each changes both axes.
@@ -246,8 +247,11 @@ def _settled(rig: Rig, unmoved_s: float = UNMOVED_S) -> tuple[Image, bool]:
     """
     begin = rig.clock.now()
     frame = _next(rig)
-    stack, moved, still = [_grey(frame.image)], False, begin
+    stack, moved, still, halts_at = [_grey(frame.image)], False, begin, begin + RESTLESS_S
     while rig.clock.now() < begin + SLOWEST_S:
+        if rig.clock.now() > halts_at:  # a dome that stops late may swing about its goal
+            _patiently(rig.head.halt)
+            halts_at = math.inf
         frame = _next(rig, frame)
         grey, now = _grey(frame.image), rig.clock.now()
         if _motion(stack[-1], grey) > STILL_PX:
