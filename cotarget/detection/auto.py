@@ -97,7 +97,7 @@ class AutoDetector:
         self._size.check(frame.image)
         width = frame.image.shape[1]
         images = halvings(frame.image, WIDEST_PX)
-        exposure = self._exposure.measure(images[-1], frame.t)
+        exposure = self._exposure.measure(images[-2:][0], frame.t)  # of 320 px it is too coarse for a person
         self._hold(held, width)
         targets, contrast = self._small_finder.find(frame, exposure)
         shift_px = self._register(frame.t, width)
