@@ -251,7 +251,7 @@ def test_a_stop_is_counted_by_nobody(at):
         for _ in range(200):
             say(mine, do="stop")
         until(lambda: at.session.noted.count(STOP) == 200)
-        assert status(mine)["stopped"] == STOP[1]
+        assert status(mine, lambda message: message["stopped"] is not None)["stopped"] == STOP[1]  # older ones may wait
 
 
 def test_sockets_are_not_compressed(at):
