@@ -31,6 +31,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from benchmarks.chromium import Browser, find, until
 from benchmarks.frame_sizes import RATE_HZ, film
 from benchmarks.pipeline_speed import calibration_of
 from benchmarks.real_time import serve
@@ -47,7 +48,6 @@ from cotarget.pipeline import Run, State, Step
 from cotarget.rig import Board, Camera, Clock, Frame, PanTiltState, Rig, ZoomState
 from cotarget.safety.safe_rig import guard
 from experiments.engine import Count, Row, Settings
-from experiments.wire.chromium import Browser, find, until
 from experiments.wire.process import EmulatedRig
 from experiments.wire.rig import Tap, beside, exact_calibration, load, tapped
 

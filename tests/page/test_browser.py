@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.chromium import Browser, find, until
 from cotarget.errors import DeviceError
 from cotarget.page.html import render
 from cotarget.page.server import Page, listen
 from cotarget.pipeline import State
-from experiments.wire.chromium import Browser, find, until
 from tests.support.page_client import SPEC, NotingSession, served, step
 
 pytestmark = [

@@ -10,12 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.chromium import Browser, find, until
 from cotarget.errors import CotargetError
 from cotarget.page import run_file
 from cotarget.page.run_file import RunFile
 from cotarget.pipeline import State
 from cotarget.rig import Frame
-from experiments.wire.chromium import Browser, find, until
 from tests.support.commands import call, refused
 from tests.support.full_disk import SAID, full_disk
 from tests.support.page_client import SPEC, step
