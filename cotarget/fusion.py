@@ -142,9 +142,8 @@ class ZoomSearch:
         matching = matching or MatchingSettings()
         self._make_finder = partial(finder or partial(CloseupFinder, settings=matching), calibration, profile)
         self._filter = filter or filter_settings(profile, calibration)
-        self._settings, self._latest_s, self._closed_loop = settings, matching.latest_s, closed_loop
+        self._settings, self._closed_loop = settings, closed_loop
         self._matching, self._sizes = matching, SizeHistory(BEAT_S)  # of the followed target's outline [tangent]
-        self._least_variance_px = matching.least_sigma_px**2
         self.states, self.clock = StateHistory(), ClockOffset(self._filter.motion)
         self.waiting: deque[Frame] = deque()
         self._zoom_t = math.inf
@@ -162,11 +161,11 @@ class ZoomSearch:
     def correct_clock(self) -> float:
         """Return what the next fixed frame's stamp has too much [s].
 
-        With another correction the target's filter begins anew by the fixed camera: a depth by wrong times stays.
+        With another correction the target's filter restarts from the fixed camera alone: a depth by wrong times stays.
         """
         late_s = self.clock.correct()
-        if self.clock.begins_anew() and self.target is not None and self.target.filter is not None:
-            self.target.filter = self.target.filter.alone()
+        if self.clock.restarts_filter() and self.target is not None and self.target.filter is not None:
+            self.target.filter = self.target.filter.from_fixed()
         return late_s
 
     def add_frame(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
@@ -237,7 +236,7 @@ class ZoomSearch:
             late = "late" if self.clock.corrected_s > 0 else "early"
             stamps = f"the fixed camera's stamps are {abs(1e3 * self.clock.corrected_s):.0f} ms {late}"
             found.append(f"{stamps} by how the target moves in both views, and are corrected")
-        if abs(self.apart_s) > self._latest_s:
+        if abs(self.apart_s) > self._matching.latest_s:
             later = "zoom" if self.apart_s < 0 else "fixed"
             apart = f"the {later} one comes {abs(self.apart_s):.2f} s later"
             found.append(f"the cameras are too far apart in time: {apart}")
@@ -259,7 +258,7 @@ class ZoomSearch:
     def _keep(self, frame: Frame, fixed_t: float) -> None:
         """Keep a zoom frame until it is due; fixed_t is the time of the newest fixed frame [s]."""
         self.waiting.append(frame)
-        while self.waiting[0].t < frame.t - self._latest_s:
+        while self.waiting[0].t < frame.t - self._matching.latest_s:
             self.waiting.popleft()
         self.apart_s = frame.t - fixed_t
 
@@ -270,7 +269,7 @@ class ZoomSearch:
             fixed_t: time of the newest fixed frame [s]; frames older than `latest_s` before it are dropped too.
         """
         due = next((each for each in reversed(self.waiting) if self.finder.fixed_view_at(each.t) is not None), None)
-        done_t = fixed_t - self._latest_s if due is None else due.t
+        done_t = fixed_t - self._matching.latest_s if due is None else due.t
         while self.waiting and self.waiting[0].t <= done_t:
             self.waiting.popleft()
         return due
@@ -292,7 +291,7 @@ class ZoomSearch:
         true = replace(pose, pan=pose.pan + estimate.bias[0], tilt=pose.tilt + estimate.bias[1])
         head_covariance = np.diag(np.square(pose.sigma * seen.focal_px))
         late_px = self.clock.sigma_s * seen.rate_px
-        covariance = searched.covariance + self._least_variance_px * np.eye(2) + head_covariance
+        covariance = searched.covariance + self._matching.least_sigma_px**2 * np.eye(2) + head_covariance
         covariance += np.outer(late_px, late_px)
         found = self.finder.find(frame, estimate.x_fixed, covariance, true)
         self._count_unfound(frame, found, replace(seen, covariance=seen.covariance + head_covariance), estimate)

@@ -136,7 +136,7 @@ class ZoomController:
         self._settings = settings
         self._speeds = speeds
         self._out_t = -math.inf
-        self._rate, self._rate_t = 0.0, -math.inf  # highest rate of the target, forgotten by and by
+        self._rate, self._rate_t = 0.0, -math.inf  # highest rate of the target, which decays
 
     def choose(
         self,

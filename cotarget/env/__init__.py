@@ -9,6 +9,7 @@ rewards. Only `info` holds ground truth.
 
 import gymnasium
 
+from cotarget.control.policy import ENVIRONMENT
 from cotarget.env.follow import Follow
 from cotarget.env.follow_v1 import FollowV1
 from cotarget.env.policies import PipelinePolicy, SchedulingPolicy
@@ -27,7 +28,7 @@ __all__ = [
     "SchedulingPolicy",
 ]
 
-FOLLOW, FOLLOW_V1, SCHEDULE = "cotarget/Follow-v0", "cotarget/Follow-v1", "cotarget/Schedule-v0"
+FOLLOW, FOLLOW_V1, SCHEDULE = "cotarget/Follow-v0", ENVIRONMENT, "cotarget/Schedule-v0"
 
 gymnasium.register(FOLLOW, entry_point="cotarget.env.follow:Follow")
 gymnasium.register(SCHEDULE, entry_point="cotarget.env.schedule:Schedule")

@@ -43,7 +43,7 @@ class ClockOffset:
         self._gained = np.diag(gained)  # variances in a second
         self._t = -math.inf  # of the last zoom frame [s]
         self.corrected_s = 0.0
-        self._begun_s = 0.0  # correction when the target filters last began anew [s]
+        self._restarted_s = 0.0  # correction when the target filter last restarted [s]
 
     @property
     def late_s(self) -> float:
@@ -78,11 +78,11 @@ class ClockOffset:
         self.corrected_s += min(max(goal_s - self.corrected_s, -SLEW_S), SLEW_S)
         return self.corrected_s
 
-    def begins_anew(self) -> bool:
-        """Whether the correction has come to another value, so that what came before it was fused wrongly; once."""
-        is_new = abs(self.corrected_s - self._begun_s) > 2 * LEAST_S and self.uncorrected_s == 0
+    def restarts_filter(self) -> bool:
+        """Whether the correction has reached another value, so that the target filter has to restart; true once."""
+        is_new = abs(self.corrected_s - self._restarted_s) > 2 * LEAST_S and self.uncorrected_s == 0
         if is_new:
-            self._begun_s = self.corrected_s
+            self._restarted_s = self.corrected_s
         return is_new
 
     def add(self, observed: Sequence[Observation]) -> None:

@@ -418,8 +418,8 @@ class TargetFilter:
         """Observations of the last `history_s`, in the order of time."""
         return self._observed
 
-    def alone(self) -> "TargetFilter":
-        """Filter the same target anew, by what the fixed camera has shown in the last `history_s`."""
+    def from_fixed(self) -> "TargetFilter":
+        """Make a filter of the same target from the observations of the fixed camera alone in the last `history_s`."""
         fixed = TargetFilter(self._calibration, self._target, self._settings)
         for each in self._observed:
             if each.sight is None:

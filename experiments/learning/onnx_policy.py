@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.control.policy import TASK_FEATURES
+from cotarget.control.policy import ENVIRONMENT, TASK_FEATURES
 
 Layer = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]  # weights (out, in) and biases (out,)
 
@@ -22,7 +22,7 @@ def write_policy(
         mean: mean of each feature.
         scale: what a feature less its mean is multiplied by.
         clip: largest absolute value of a normalised feature.
-        action: what its actions mean in `cotarget/Follow-v1`, "rates" or "residual".
+        action: what its actions mean in `ENVIRONMENT`, "rates" or "residual".
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
@@ -56,6 +56,6 @@ def write_policy(
     ]
     graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], own)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    helper.set_model_props(model, {"environment": "cotarget/Follow-v1", "action": action})
+    helper.set_model_props(model, {"environment": ENVIRONMENT, "action": action})
     onnx.checker.check_model(model)
     onnx.save(model, path)

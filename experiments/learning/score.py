@@ -56,14 +56,14 @@ def main() -> None:
     options = parser.parse_args()
     seeds = range(FIRST_SEED, FIRST_SEED + options.seeds)
     pipeline = np.array(score(options.target, "pipeline", seeds))
-    print(json.dumps({"pipeline": told(pipeline)}))
+    print(json.dumps({"pipeline": mean_of(pipeline)}))
     for file in options.files or [None]:
         found = np.array(score(options.target, "proportional" if file is None else "file", seeds, file))
-        ahead = told(found - pipeline)
-        print(json.dumps({str(file or "proportional"): {**told(found), "ahead": ahead}}))
+        ahead = mean_of(found - pipeline)
+        print(json.dumps({str(file or "proportional"): {**mean_of(found), "ahead": ahead}}))
 
 
-def told(values: np.ndarray[Any, Any]) -> dict[str, float]:
+def mean_of(values: np.ndarray[Any, Any]) -> dict[str, float]:
     """Mean and half its 95 % interval."""
     return {
         "mean": round(float(values.mean()), 4),

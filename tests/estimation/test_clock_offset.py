@@ -58,8 +58,8 @@ def test_a_standing_target_shows_no_offset():
 
 def test_stamps_are_corrected_step_by_step_and_frames_stay_in_their_order():
     clock = estimated(Flight("bird", 300, 8.0), -0.1)
-    corrections, begun = zip(*((clock.correct(), clock.begins_anew()) for _ in range(25)), strict=True)
-    assert sum(begun) == 1  # filters begin anew once, when the correction is there
+    corrections, begun = zip(*((clock.correct(), clock.restarts_filter()) for _ in range(25)), strict=True)
+    assert sum(begun) == 1  # the filter restarts once, when the correction is there
     assert corrections[-1] == clock.late_s
     assert np.diff(np.arange(25) / 100 - corrections).min() >= -math.ulp(1.0)  # at a hundred frames a second
 

@@ -144,7 +144,7 @@ def test_the_zoom_cameras_size_outweighs_a_part_in_the_fixed_image():
     assert ends[1] == pytest.approx(flight.size, rel=BY_OUTLINES)
 
 
-def test_a_filter_begun_anew_by_the_fixed_camera_is_one_that_saw_no_zoom_image():
+def test_a_filter_from_the_fixed_camera_alone_is_one_that_saw_no_zoom_image():
     flight = Flight("person", 300, 1.2)
     both, fixed = (TargetFilter(flight.calibration, flight.target) for _ in range(2))
     for t in flight.times:
@@ -152,7 +152,7 @@ def test_a_filter_begun_anew_by_the_fixed_camera_is_one_that_saw_no_zoom_image()
         for each in (both, fixed):
             assert each.add_fixed(box, t)
         assert show(both, view)
-    assert both.alone().estimate(t).state == pytest.approx(fixed.estimate(t).state, rel=SAME)
+    assert both.from_fixed().estimate(t).state == pytest.approx(fixed.estimate(t).state, rel=SAME)
     assert both.estimate(t).depth != fixed.estimate(t).depth
 
 
