@@ -98,7 +98,9 @@ def _run(options: argparse.Namespace, opened_first: ExitStack) -> int:
     seconds = math.inf if options.seconds is None else options.seconds
 
     def make_recorder(folder: Path) -> Recorder:
-        return Recorder(folder, config, file, name, selection.selector)
+        return Recorder(
+            folder, config, file, name, selection.selector, None if settings.policy is None else settings.policy.path
+        )
 
     def make_run(rig: "Rig") -> Run:
         return Run(rig, calibration, target, selector=Selection(options, spec.fixed.size).selector, settings=settings)

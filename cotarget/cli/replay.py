@@ -42,7 +42,9 @@ def run(options: argparse.Namespace) -> int:
     """Run the pipeline on a recording and compare its commands; return the exit status."""
     from cotarget.backends import open_recording
     from cotarget.calibration import Calibration
+    from cotarget.control.policy import OnnxPolicy
     from cotarget.page.run_file import RunFile
+    from cotarget.pipeline import FollowSettings
     from cotarget.recording.replay import Replay
     from cotarget.safety.safe_rig import guard
     from cotarget.track_metrics import read_labels
@@ -63,7 +65,10 @@ def run(options: argparse.Namespace) -> int:
     def operated(rig: "Rig", run: "Run") -> "Iterator[Step]":
         return run.follow(orders=played.orders)
 
-    run = RunInputs(opened, config, calibration, name, rate_hz, selection, math.inf, recording.steps, played)
+    settings = None if recording.policy is None else FollowSettings(policy=OnnxPolicy(recording.policy))
+    run = RunInputs(
+        opened, config, calibration, name, rate_hz, selection, math.inf, recording.steps, played, settings=settings
+    )
     if recording.orders:
         run = dataclasses.replace(run, operated=operated)
     with RunFile(options.html, recording) if options.html else nullcontext() as page:

@@ -3,6 +3,7 @@
     recording.json         schema, versions, when, target, whom, config; written after the next two, before the log
     calibration.json       byte-for-byte copy of the run's calibration
     template.*             image of a target that is detected by a template
+    policy.onnx            copy of the learnt policy that drove head and lens, if one did
     log.jsonl              one JSON object a line, appended and flushed: the facts of the rig, then each call with its
         arguments, result and time; an operator's order comes before the calls that it leads to
     fixed/ and zoom/       frames as PNG, numbered; the line that names an image is written after the image is complete
@@ -44,6 +45,7 @@ from cotarget.rig import (
 
 SCHEMA = 1
 META, LOG, CALIBRATION, TEMPLATE = "recording.json", "log.jsonl", "calibration.json", "template"
+POLICY = "policy.onnx"
 FIXED, ZOOM = "fixed", "zoom"  # the frames' folders
 COMPLETE = "complete"  # value of `end` for a run that nothing interrupted
 Number = float | bool | None
@@ -330,6 +332,7 @@ class Recording:
         truncated: whether the log has no end; then the last step, which may be incomplete, is left out.
         notes: remarks for the user, one line each.
         when: date and time at which it began, as text; empty in one that does not say.
+        policy: path of the learnt policy that drove head and lens; None for none.
     """
 
     directory: Path
@@ -344,6 +347,7 @@ class Recording:
     notes: tuple[str, ...]
     orders: tuple[tuple[int, Order], ...] = ()
     when: str = ""
+    policy: Path | None = None
 
     @property
     def steps(self) -> int:
@@ -419,6 +423,7 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
         tuple(notes),
         tuple(orders),
         str(meta.get("when", "")),
+        directory / POLICY if (directory / POLICY).exists() else None,
     )
 
 

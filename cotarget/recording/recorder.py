@@ -36,6 +36,7 @@ from cotarget.recording.format import (
     FIXED,
     LOG,
     META,
+    POLICY,
     SCHEMA,
     TEMPLATE,
     ZOOM,
@@ -357,6 +358,7 @@ class Recorder(contextlib.AbstractContextManager["Recorder", None]):
         calibration: Path,
         target: str,
         selector: TargetSelector | None = None,
+        policy: Path | None = None,
     ) -> None:
         """Make the folder, and store configuration, calibration and target.
 
@@ -366,6 +368,7 @@ class Recorder(contextlib.AbstractContextManager["Recorder", None]):
             calibration: path of calibration.json, which is copied.
             target: name of the target that will be followed.
             selector: selects among several targets; None for the first that comes.
+            policy: file of the learnt policy that drives head and lens, which is copied; None for none.
 
         Raises:
             ConfigError: the folder is not empty, a file cannot be read or written, or there is no such target.
@@ -380,7 +383,7 @@ class Recorder(contextlib.AbstractContextManager["Recorder", None]):
         except OSError as error:
             raise ConfigError(f"{directory}: cannot hold a recording: {error.strerror}") from None
         try:
-            self._write_beginning(config, calibration, target, selector)
+            self._write_beginning(config, calibration, target, selector, policy)
             self._writer = RecordWriter(directory)
         except BaseException as error:
             self._remove()
@@ -439,7 +442,12 @@ class Recorder(contextlib.AbstractContextManager["Recorder", None]):
             raise CotargetError(f"{self._directory}: the recording is cut short: {self._writer.failure}")
 
     def _write_beginning(
-        self, config: RigConfig, calibration: Path, target: str, selector: TargetSelector | None
+        self,
+        config: RigConfig,
+        calibration: Path,
+        target: str,
+        selector: TargetSelector | None,
+        policy: Path | None,
     ) -> None:
         chosen = config.target(target)
         if chosen.template is not None:
@@ -448,6 +456,8 @@ class Recorder(contextlib.AbstractContextManager["Recorder", None]):
             chosen = dataclasses.replace(chosen, template=Path(copy))
         # Not shutil.copy: on a full disk its error names the file that it reads.
         (self._directory / CALIBRATION).write_bytes(calibration.read_bytes())
+        if policy is not None:
+            (self._directory / POLICY).write_bytes(policy.read_bytes())
         table = {
             "schema": SCHEMA,
             "cotarget": version("cotarget"),
@@ -470,7 +480,7 @@ class Recorder(contextlib.AbstractContextManager["Recorder", None]):
             with contextlib.suppress(OSError):
                 (self._directory / folder).rmdir()
         for path in self._directory.iterdir():
-            if path.name in (META, f"{META}.part", LOG, CALIBRATION) or path.stem == TEMPLATE:
+            if path.name in (META, f"{META}.part", LOG, CALIBRATION, POLICY) or path.stem == TEMPLATE:
                 path.unlink(missing_ok=True)
         if self._made:
             with contextlib.suppress(OSError):

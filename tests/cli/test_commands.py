@@ -246,8 +246,12 @@ def test_follow_takes_a_learnt_policy_as_a_file(folder, capsys):
     pytest.importorskip("onnx", reason="writes policies")
     still = np.zeros((3, 14), np.float32), np.zeros(3, np.float32)
     write_policy(folder / "still.onnx", [still], np.zeros(14), np.ones(14), 10.0, "rates")
-    status, out, err = call(capsys, *FOLLOW, "--seconds", "0.3", "--policy", "still.onnx")
-    assert (status, err, json.loads(out)["steps"] >= 6) == (0, "", True)
+    options = "--seconds", "0.3", "--policy", "still.onnx"
+    status, out, err = call(capsys, *FOLLOW, *options, "--record", "run")
+    assert (status, err, json.loads(out)["states"]["following"] > 0) == (0, "", True)
+    (folder / "still.onnx").unlink()  # the recording has its own
+    assert call(capsys, "replay", "run", "--check")[0] == 0
+    write_policy(folder / "still.onnx", [still], np.zeros(14), np.ones(14), 10.0, "rates")
     said = refused(capsys, *FOLLOW, "--policy", "none.onnx")
     assert said == "cotarget follow: --policy: none.onnx: no such file; give a policy as an ONNX file"
 
