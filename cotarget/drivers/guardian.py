@@ -17,7 +17,7 @@ import sys
 import time
 
 # What is sent: whether by UDP, host, port, and the messages, in Latin-1.
-Order = tuple[bool, str, int, list[str]]
+StopOrder = tuple[bool, str, int, list[str]]
 SEND_S = 0.5  # for a connection, and for its answer [s]
 TRIES, PAUSE_S = 3, 0.05  # how often all orders are sent, and the time between datagrams [s]
 LONGEST = 1 << 16  # bytes of a pipe: more cannot be written at once
@@ -50,10 +50,10 @@ class Guardian:
             os.close(reads)
         self.pid = self._process.pid
         os.set_blocking(self._pipe, False)  # a process that is suspended must not hold up the head
-        self._held = list[Order]()
+        self._held = list[StopOrder]()
         self._is_closed = False
 
-    def hold(self, orders: list[Order]) -> None:
+    def hold(self, orders: list[StopOrder]) -> None:
         """Replace what is sent if this program dies; nothing for a device that stands.
 
         Raises:
@@ -88,7 +88,7 @@ class Guardian:
 
 def watch(pipe: int) -> None:
     """Read orders until the pipe ends, then send the last whole ones."""
-    rest, orders = b"", list[Order]()
+    rest, orders = b"", list[StopOrder]()
     while data := os.read(pipe, LONGEST):
         *lines, rest = (rest + data).split(b"\n")
         if lines:

@@ -26,7 +26,7 @@ from urllib.parse import urlsplit
 from xml.etree.ElementTree import Element
 
 from cotarget.drivers.axes import AXES, AxisFacts, Poll
-from cotarget.drivers.guardian import Order
+from cotarget.drivers.guardian import StopOrder
 from cotarget.drivers.head_link import Pair, Requests
 from cotarget.drivers.link_errors import CutError, RefusedError, SilentError
 from cotarget.drivers.polled_head import UNHEARD_S
@@ -301,7 +301,7 @@ class OnvifDevice:
         """Send a command; raises as `SoapClient.call` does."""
         self._ask(self._ptz, PTZ, message, self._token + inner, timeout)
 
-    def order(self, message: str, inner: str) -> Order:
+    def order(self, message: str, inner: str) -> StopOrder:
         """Write a command for a `Guardian`."""
         host, _, port = self._address.rpartition(":")
         signed = self.soap.signed(self._ptz, PTZ, message, self._token + inner)

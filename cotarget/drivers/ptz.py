@@ -27,7 +27,7 @@ from annotated_types import Interval, Lt
 from cotarget.config import SafetyConfig
 from cotarget.drivers.axes import AxisFacts
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.guardian import Guardian, Order
+from cotarget.drivers.guardian import Guardian, StopOrder
 from cotarget.drivers.head_link import HeadLink
 from cotarget.drivers.lens import LensPositions
 from cotarget.drivers.polled_head import (
@@ -159,7 +159,7 @@ class PtzLink(HeadLink):
         """Halt the device and set it up for moves; by default only the halt."""
         self.halt(LOOP_HALT_S + braking_s(self.axes))
 
-    def guard(self, orders: list[Order]) -> None:
+    def guard(self, orders: list[StopOrder]) -> None:
         """Have a process of its own send orders if this program is killed; none for a device that then stands."""
         try:
             if self._guardian is None:

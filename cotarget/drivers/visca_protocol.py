@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from cotarget.drivers.guardian import Order
+from cotarget.drivers.guardian import StopOrder
 from cotarget.drivers.link_errors import LostError, RefusedError, ReplyError, SilentError
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.rig import Clock
@@ -349,7 +349,7 @@ class Line:
                     raise
             self._clock.sleep_until(self._clock.now() + BUSY_PAUSE_S)
 
-    def last_stop(self) -> Order:
+    def last_stop(self) -> StopOrder:
         """Write a stop for a `Guardian`: with Sony's header the first message after a reset of the counter."""
         host, port, *_ = self._socket.getpeername()
         messages = [STOP]
