@@ -97,6 +97,7 @@ class FrameSource:
         self._fixed_t = self._fixed_changed_t = self._zoom_t = self._zoom_changed_t = -math.inf
         self._zoom_fault = self._fixed_fault = ""
         self._read_t = -math.inf  # when it came, on the rig's clock [s]
+        self._passed: int | None = None
         self.interval, self.zoom_is_new = math.inf, False
 
     def read_fixed(self) -> Frame:
@@ -138,6 +139,10 @@ class FrameSource:
         if before is None or not frame.repeated:
             self._fixed_changed_t = frame.t
         self.interval = frame.t - self._fixed_t
+        if before is None or before.number is None or frame.number is None:
+            self._passed = None
+        else:
+            self._passed = frame.number - before.number - 1
         self._fixed_frame, self._fixed_t, self._read_t = frame, frame.t, now
         return frame
 
@@ -167,6 +172,12 @@ class FrameSource:
         if self._fixed_t - self._zoom_t > GONE_S:
             raise StaleFrameError(self._describe_stale_zoom())
         return before
+
+    def skipped(self, rate_hz: float) -> int:
+        """Count the fixed frames between the last two that were read: by their numbers, or else by the rate."""
+        if self._passed is not None:
+            return self._passed
+        return 0 if math.isinf(self.interval) else max(round(self.interval * rate_hz) - 1, 0)
 
     def faults(self) -> list[str]:
         """Describe what is wrong with the newest frames, one message each.
@@ -318,7 +329,8 @@ class Step:
         expected: the target as it should appear in the zoom frame, at that frame's time; None if that is not known.
         head_commands: commands sent to the head since the run began.
         lens_commands: commands sent to the lens since the run began.
-        skipped: frames of the fixed camera that were not worked on since the previous step, by its rate.
+        skipped: frames of the fixed camera that were not worked on since the previous step, refused ones too; by its
+            rate where nobody counts them.
         ignored: regions of the fixed frame in which nothing is detected.
     """
 
@@ -713,7 +725,7 @@ class Run:
             expected=None if target is None else head.search.expect(zoom.t),
             head_commands=head.controller.head_commands,
             lens_commands=head.controller.lens_commands,
-            skipped=self._skipped(),
+            skipped=frames.skipped(self._rig.spec.fixed.rate_hz),
             ignored=self.camera.ignored,
         )
 
@@ -746,8 +758,3 @@ class Run:
             self._rig.clear()
         elif order.of in ("", HEAD):
             self.head.obey(order)
-
-    def _skipped(self) -> int:
-        """Number of frames of the fixed camera between the last two that were worked on."""
-        interval = self._frames.interval
-        return 0 if math.isinf(interval) else max(round(interval * self._rig.spec.fixed.rate_hz) - 1, 0)

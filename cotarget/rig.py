@@ -38,11 +38,13 @@ class Frame:
         image: (H, W, 3) BGR.
         t: middle of the exposure [s].
         repeated: whether its camera is known to repeat the image before, with a new time.
+        number: how many frames had come from its camera, this one and refused ones included; None if nobody counts.
     """
 
     image: Image
     t: float
     repeated: bool = False
+    number: int | None = None
 
 
 @dataclass(frozen=True)

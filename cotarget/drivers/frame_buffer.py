@@ -64,6 +64,7 @@ class _Newest:
     t: float
     arrived: float
     before: float  # arrival of the frame before [s]
+    number: int
     image: Image | None = None
     read: bool = False
 
@@ -93,6 +94,7 @@ class FrameBuffer:
         # Guards everything below, which is shared with the camera's thread.
         self._changed = threading.Condition()
         self._counts = FrameCounts()
+        self._came = 0  # frames that came, refused ones too
         self._newest: _Newest | None = None
         self._last: Hashable = None  # what tells the newest frame from a repeated one, even if it cannot be decoded
         self._new_at = self._heard_at = clock.now()  # arrival of the newest frame, and of anything
@@ -183,13 +185,16 @@ class FrameBuffer:
                 self._frozen = True
                 return False
             self._last = own
+            self._came += 1
             if took > self._fresh_s:
                 self._refuse(f"its frames take {took:.2g} s to come", 1)
                 return True
             skipped = 1 if self._newest is not None and not self._newest.read else 0
             counts = self._counts
             self._counts = replace(counts, frames=counts.frames + 1, skipped=counts.skipped + skipped)
-            self._newest = _Newest(data, arrived - self.latency_s if t is None else t, arrived, self._new_at)
+            self._newest = _Newest(
+                data, arrived - self.latency_s if t is None else t, arrived, self._new_at, self._came
+            )
             self._new_at = arrived
             self._frozen, self._refused, self._remark, self._lost = False, "", "", ""
             self._changed.notify_all()
@@ -199,6 +204,7 @@ class FrameBuffer:
         """Count frames that were cut short."""
         if count:
             with self._changed:
+                self._came += count
                 self._refuse(self._broken, count)
 
     def remark(self, text: str) -> None:
@@ -302,7 +308,7 @@ class FrameBuffer:
                 raise DeviceError(
                     f"{self.name} now sends {now} where it sent {was}: set its resolution back, or open it again"
                 )
-            return Frame(image, newest.t)
+            return Frame(image, newest.t, number=newest.number)
 
     def close(self) -> None:
         """End every `read` and `keep_open`; called before the driver breaks off its connection."""

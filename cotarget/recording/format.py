@@ -84,6 +84,7 @@ class Event:
         error_class: name of its nearest base class in `cotarget.errors`, for an exception of another module.
         aside: whether another thread than the run's own called, such as a watchdog.
         repeated: whether a frame repeats the one before, where comparing their images says otherwise.
+        number: a frame's `Frame.number`.
     """
 
     call: str
@@ -96,6 +97,7 @@ class Event:
     error_class: str = ""
     aside: bool = False
     repeated: bool | None = None
+    number: int | None = None
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -150,6 +152,8 @@ def event_line(event: Event) -> str:
         row["aside"] = True
     if event.repeated is not None:
         row["repeated"] = event.repeated
+    if event.number is not None:
+        row["number"] = event.number
     return json.dumps(row, allow_nan=False)
 
 
@@ -170,16 +174,19 @@ def parse_event(row: Mapping[str, Any]) -> Event:
     arities, numbers = CALLS[call]
     if len(args) not in arities or len(result) not in ((0,) if error else numbers) or None in result:
         raise ValueError(f"{call} has other numbers")
-    image, size = row.get("image"), row.get("bytes", 0)
+    image, size, count = row.get("image"), row.get("bytes", 0), row.get("number")
     if image is not None and not (isinstance(image, str) and _is_inside(image) and call in FRAMES):
         raise ValueError("image is no file of the recording")
     if type(size) is not int:
         raise ValueError("bytes is not a whole number")
+    if count is not None and type(count) is not int:
+        raise ValueError("number is not a whole number")
     at = float(row["at"])
     if not math.isfinite(at):
         raise ValueError("at is not finite")
     named, aside, repeated = str(row.get("error_class", "")), row.get("aside") is True, row.get("repeated")
-    return Event(call, at, args, result, image, size, error, named, aside, None if repeated is None else bool(repeated))
+    repeated = None if repeated is None else bool(repeated)
+    return Event(call, at, args, result, image, size, error, named, aside, repeated, count)
 
 
 def is_same(a: Image, b: Image) -> bool:

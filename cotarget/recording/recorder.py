@@ -224,7 +224,8 @@ class _CallLog:
         result = result_numbers(answer)
         at = answer if name == "clock.now" else self._clock.now()
         frame = answer if isinstance(answer, Frame) else None
-        writer.put(Event(name, at, args, result, aside=aside), name.split(".")[0], frame)
+        number = None if frame is None else frame.number
+        writer.put(Event(name, at, args, result, aside=aside, number=number), name.split(".")[0], frame)
         return answer
 
 

@@ -378,7 +378,7 @@ class _Camera:
         last, repeated = self._last, event.repeated
         if repeated is None:
             repeated = last is not None and is_same(image, last.image)
-        frame = Frame(image, event.numbers[0], repeated)
+        frame = Frame(image, event.numbers[0], repeated, event.number)
         if last is None or frame.t > last.t:
             self._last = frame
         return frame

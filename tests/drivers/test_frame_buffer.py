@@ -60,6 +60,20 @@ def test_the_newest_frame_is_read_with_the_time_of_its_exposure(bench, encode):
     assert (bench.frames.counts.frames, bench.frames.counts.skipped) == (3, 2)
 
 
+def test_a_frames_number_counts_all_that_came(bench):
+    """One that is read, one that nobody reads, and four that are refused; a repeated one is not counted again."""
+    bench.put(jpeg(10))
+    assert bench.read().number == 1
+    bench.put(jpeg(20))
+    bench.put(jpeg(20))
+    bench.frames.refuse(2)
+    bench.put(jpeg(30), took=2 * FRESH_S)
+    bench.put(b"no JPEG")
+    assert "broken" in bench.why(None)
+    bench.put(jpeg(40))
+    assert bench.read().number == 7
+
+
 @pytest.mark.parametrize(
     ("encode", "own", "again"),
     [(jpeg, {}, {}), (image, {"t": 99.5}, {"t": 99.5}), (jpeg, {"serial": 7, "t": 99.5}, {"serial": 7, "t": 99.6})],

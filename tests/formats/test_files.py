@@ -422,7 +422,7 @@ REPLAYED = [
 
 
 LATER = ("fixed_rate_hz", "fixed_latency_s", "zoom_rate_hz", "zoom_latency_s", "zoom_pitch_mm", "zoom_delay_s",
-         "head_delay_s", "error_class", "repeated")  # keys that v0.1.0 did not write  # fmt: skip
+         "head_delay_s", "error_class", "repeated", "number")  # keys that v0.1.0 did not write  # fmt: skip
 
 
 def plain_log(folder):

@@ -36,6 +36,7 @@ from tests.support.recorded_run import (
     SIZE,
     STEP,
     Bright,
+    ToyCamera,
     ToyDevices,
     ToyZoomCamera,
     calibration,
@@ -138,6 +139,28 @@ def test_frames_are_repeated_as_their_camera_said(tmp_path):
     older, _ = replay(tmp_path / "run")
     same = [np.array_equal(a.zoom.image, b.zoom.image) for a, b in itertools.pairwise(steps)]
     assert [step.zoom.repeated for step in older] == [False, *same]
+
+
+class Counting(ToyCamera):
+    """Gives frames at uneven times, counts them, and loses every tenth."""
+
+    def read(self, newer_than=None, timeout=1.0):
+        frame = super().read(newer_than, timeout)
+        index = round(frame.t * self.rate_hz)
+        return dataclasses.replace(frame, t=frame.t + 0.03 * (index % 2), number=index + index // 10)
+
+
+def test_frames_that_a_camera_counts_are_skipped_by_their_numbers(tmp_path):
+    """By the rate of 25 Hz every interval of 70 ms would hide one, and those that are lost would be none."""
+    devices = ToyDevices()
+    devices.fixed = Counting(devices, "fixed", RATE_HZ)
+    steps = record(tmp_path / "run", calibration_file(tmp_path), devices, seconds=1.2)
+    numbers = [step.fixed.number for step in steps]
+    assert [step.skipped for step in steps] == [0, *np.diff(numbers) - 1]
+    assert sum(step.skipped for step in steps) in (2, 3)
+    again, differences = replay(tmp_path / "run")
+    assert differences.same
+    assert [step.skipped for step in again] == [step.skipped for step in steps]
 
 
 def test_a_rig_in_real_time_replays_to_the_last_bit(tmp_path):
