@@ -4,7 +4,8 @@ Headless Chromium is the browser. Its pictures are timed from when a step is don
 else at work; beside a run that follows in films of 640x480, which another process sends in real time as an emulated
 Axis server does, with the head emulated there too; and beside a run on the emulated rig, which renders. A click and a
 Stop are timed from the browser's own event until the first byte of the order on the head's line, in whatever the run
-does then. The turns of the run, from a frame's arrival to the end of its step, are compared with no browser and with
+does then. On the emulated rig an arrow key turns the head until Stop; the emulator's true angles tell when it stands.
+The turns of the run, from a frame's arrival to the end of its step, are compared with no browser and with
 ten, of which one reads nothing and one is Chromium. All of it stands on one machine: its load is printed.
 
 `--set page.soak_s=600` follows in the films for so long with the page open, and gives the frames sent that are neither
@@ -15,6 +16,7 @@ import asyncio
 import contextlib
 import itertools
 import json
+import math
 import multiprocessing
 import os
 import re
@@ -45,7 +47,7 @@ from cotarget.operate.session import Session
 from cotarget.page.html import render
 from cotarget.page.server import LOOPBACK, Page, listen
 from cotarget.pipeline import Run, State, Step
-from cotarget.rig import Board, Camera, Clock, Frame, PanTiltState, Rig, ZoomState
+from cotarget.rig import Board, Camera, Clock, Frame, HeadSpec, PanTiltState, Rig, ZoomState
 from cotarget.safety.safe_rig import guard
 from experiments.engine import Count, Row, Settings
 from experiments.wire.process import EmulatedRig
@@ -57,6 +59,8 @@ BLOCKS = 6  # of turns, without browsers and with them in turns
 LONGEST_S = 4500.0  # of the films [s]
 SETTLE_S = 0.3  # until what an order has moved stands
 SETTLED_S = 2.0  # until the browser has compiled the page's code
+HELD_S, SPEED_S, STANDS_S = 1.2, 0.2, 1.0  # a key is held; the end of it that gives the speed; until the head stands
+EVERY_S = 0.004  # between two looks at the emulator's angles
 MINUTE = 60  # samples of memory
 GOES = re.compile(rb"(?:^| )[PT]P-?\d")  # a position that a D46 is sent to
 HALTS = re.compile(rb"(?:^| )H ")
@@ -84,6 +88,7 @@ CLICK = """(() => {
 # Goals: a picture's way [ms] by what runs beside it, an order's way [ms], the turn's ratio, and the page.
 DRAWN_MS = {"nothing": 40.0, "films": 60.0, "rendered": 250.0}
 CLICK_MS, STOP_MS = 1e3 / RATE_HZ + 60, 60.0
+REST_MS = 50.0  # beyond the head's own delay and braking
 RATIO, BYTES, FIRST_MS, GROWTH = 1.3, 60_000, 500.0, 1.05
 
 
@@ -266,13 +271,12 @@ def _beside_rendering(settings: PageSettings, browser: Browser, folder: Path, se
     with EmulatedRig(folder, tables) as emulated:
         config = emulated.config()
         with backends.open_rig(config, guarded=False, file=emulated.hardware_toml) as rig:
-            return _operate(
-                rig,
-                exact_calibration(emulated.sim),
-                config.target("bird"),
-                lambda operated: _follow_and_draw(browser, operated.page.link, "rendered", settings.seconds),
-                folder,
-            )
+
+            def act(operated: Operated) -> list[Row]:
+                rows = _follow_and_draw(browser, operated.page.link, "rendered", settings.seconds)
+                return rows + _rests(browser, emulated, rig.spec.head, settings.orders)
+
+            return _operate(rig, exact_calibration(emulated.sim), config.target("bird"), act, folder)
 
 
 def _follow_and_draw(browser: Browser, link: str, what: str, seconds: float) -> list[Row]:
@@ -371,6 +375,45 @@ def _on_the_wire(begun_ms: float, order: "re.Pattern[bytes]", taps: Sequence[Tap
         return min(times, default=None)
 
     return 1e3 * until(sent) - begun_ms  # type: ignore[operator]  # it waits until there is one
+
+
+def _rests(browser: Browser, emulated: EmulatedRig, head: HeadSpec, count: int) -> list[Row]:
+    """Turn by a held key until Stop, again and again; give a row for each with the time until the head stands.
+
+    That is from the browser's event, less the head's own delay and its braking from the speed that it had [ms].
+    """
+    assert head.limits.pan.acceleration is not None
+    rows: list[Row] = []
+    for number in range(count):
+        _press(browser, "home")
+        until(lambda: browser.text("word") == "Standing")
+        arrow = ("ArrowLeft", "ArrowRight")[number % 2]
+        browser.key(arrow, "keyDown")
+        before = _pans(emulated, HELD_S)
+        begun = time.monotonic() + browser.js(STOP) / 1e3 - time.time()
+        after = _pans(emulated, STANDS_S)
+        browser.key(arrow, "keyUp")
+        t, pan = np.transpose(before)
+        late = t > t[-1] - SPEED_S
+        speed = abs(float(np.polyfit(t[late], pan[late], 1)[0]))
+        stood = next((at for at, pan in reversed(after) if pan != after[-1][1]), begun)
+        own = head.delay_s + math.radians(speed) / head.limits.pan.acceleration
+        rows.append({"figure": "rest", "value": 1e3 * (stood - begun - own), "speed": speed})
+        until(lambda: browser.text("word") == "Stopped")
+        _press(browser, "clear")
+        until(lambda: browser.text("word") != "Stopped")
+    return rows
+
+
+def _pans(emulated: EmulatedRig, seconds: float) -> list[tuple[float, float]]:
+    """Look at the head for so long; give times of the monotonic clock [s] and true pan angles [degrees]."""
+    poses = []
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        truth = emulated.truth()
+        poses.append((truth["t"], truth["pan_deg"]))
+        time.sleep(EVERY_S)
+    return poses
 
 
 # Turns
@@ -476,6 +519,9 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
             rate_hz = float(np.median(values("rate", beside=what)))
             found[f"drawn beside {what}"] = percentiles(ways) | {"rate_hz": rate_hz}
     found |= {figure: percentiles(values(figure)) for figure in ("click", "stop")}
+    if rests := values("rest"):
+        speeds = [row["speed"] for row in rows if row["figure"] == "rest"]
+        found["rest"] = percentiles(rests) | {"speed_deg_s": float(np.median(speeds))}
     alone, many = (percentiles(values("turn", browsers=count)) for count in (0, OTHERS + 1))
     found["turn"] = {
         "alone_p95_ms": alone["p95_ms"],
@@ -499,6 +545,8 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
         for what, most in DRAWN_MS.items()
         if (found := summary.get(f"drawn beside {what}"))
     }
+    if rest := summary.get("rest"):
+        reached["rest"] = rest["p95_ms"] <= REST_MS
     if soak := summary.get("soak"):
         reached["soak"] = abs(soak["not_accounted"]) < 1 and soak["memory_ratio"] <= GROWTH
     return [name for name, well in reached.items() if not well]
