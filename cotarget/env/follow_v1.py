@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -28,17 +27,15 @@ from cotarget.env.common import (
     IMAGE_SIZE,
     RIG_FEATURES,
     Command,
-    Episode,
     Kind,
     Vector,
     box,
-    number_in,
     one_of,
-    require,
 )
 from cotarget.env.follow import Follow
-from cotarget.env.rewards import REWARDS, Reward, closeness, shaped
-from cotarget.env.variation import Randomization, Variation, randomization_of
+from cotarget.env.rewards import Reward, closeness_of
+from cotarget.env.variation import Randomization
+from cotarget.env.version1 import GAMMA, Version1
 from cotarget.evaluation import TruthNoise
 from cotarget.metrics import Closeup
 from cotarget.rig import Rig
@@ -47,10 +44,9 @@ from cotarget.sim.targets.random_paths import LONE, SECONDS, lone_path
 
 Action = Literal["absolute", "rates", "residual"]
 ACTIONS: tuple[Action, ...] = get_args(Action)
-GAMMA = 0.99
 
 
-class FollowV1(Follow):
+class FollowV1(Version1[Any, Vector], Follow):
     """Hold a target in the close-up, with actions and features on the scale of the task.
 
     World, target, noise, episodes and `info` are those of `Follow`. Different are:
@@ -66,14 +62,13 @@ class FollowV1(Follow):
 
     Reward: "yield" as in `Follow`; "dense" the closeness of the newest zoom frame, 0 to 1, of the target's offset in
     half-widths and its size ratio; "shaped" the yield plus gamma times the closeness after the step less that before.
+    Each less `wear` times the way from the command before to the new one, in half-widths and steps of 10 % of the focal
+    length.
 
     `info` has `potential` besides, the closeness.
 
     Attributes:
         action: what actions mean.
-        reward: what is rewarded.
-        gamma: discount of the learner.
-        randomize: ranges of what differs between episodes; None where nothing does.
     """
 
     _kinds = ("tracks", "images", "both")
@@ -85,6 +80,7 @@ class FollowV1(Follow):
         reward: Reward = "dense",
         observation: Kind = "tracks",
         gamma: float = GAMMA,
+        wear: float = 0.0,
         randomize: Randomization | bool | None = None,
         rig: RigConfig | Path | str | None = None,
         calibration: Calibration | Path | str | None = None,
@@ -101,6 +97,7 @@ class FollowV1(Follow):
             reward: "yield", "dense" or "shaped".
             observation: "tracks", "images" or "both".
             gamma: discount of the learner, for the reward "shaped".
+            wear: cost of a unit of commanded motion.
             randomize: ranges of what differs between episodes; True for the usual ones.
             rig: as in `Follow`; a path that its `[sim.paths]` gives the target counts.
             calibration: calibration that features and policies use, or its file; the true one by default.
@@ -112,10 +109,8 @@ class FollowV1(Follow):
         Raises:
             ConfigError: an argument is invalid.
         """
-        self.action, self.reward = one_of("action", action, ACTIONS), one_of("reward", reward, REWARDS)
-        require(number_in(gamma, 0.0, 1.0), "gamma", gamma, "a number above 0 and up to 1")
-        self.gamma, self.randomize = float(gamma), randomization_of(randomize)
-        self._variation = Variation()
+        self.action = one_of("action", action, ACTIONS)
+        self._set_up(reward, gamma, wear, randomize)
         super().__init__(target, observation, rig, calibration, seconds, image_size, noise, render_mode)
 
     def _space(self) -> gymnasium.Space[Any]:
@@ -139,21 +134,6 @@ class FollowV1(Follow):
     def _path(self, seed: int) -> Mapping[str, tuple[Waypoint, ...]]:
         return {self.name: self.path(seed)}
 
-    def _begin(self, seed: int | None, options: Mapping[str, Any] | None) -> int:
-        seed = super()._begin(seed, None)
-        drawn = Variation() if self.randomize is None else self.randomize.draw(self.np_random)
-        self._variation = drawn.with_options(options)
-        return seed
-
-    def _made(self, config: RigConfig) -> Episode:
-        varied = self._variation
-        return Episode(replace(config, sim=varied.sim(config.sim)), varied.noises(self._noise))
-
-    @property
-    def calibration(self) -> Calibration:
-        """The given calibration or the exact one, with the episode's error."""
-        return self._variation.calibrated(super().calibration)
-
     def _start(self, rig: Rig) -> None:
         super()._start(rig)
         calibration = self.calibration.for_streams(rig.fixed.size, rig.zoom.size)
@@ -163,7 +143,7 @@ class FollowV1(Follow):
         self._potential = 0.0
 
     def _command(self, action: Vector) -> Command:
-        rig = self.episode.rig
+        rig, self._commanded_before = self.episode.rig, self._commanded
         effect_t = rig.clock.now() + rig.spec.head.delay_s
         pan, tilt, focal_px = self.units.command(action)
         if self.action == "absolute":
@@ -184,19 +164,11 @@ class FollowV1(Follow):
 
     def _judge(self) -> Closeup:
         judged = super()._judge()
-        width, height = judged.width_px, judged.height_px
-        off_px = math.hypot(judged.u_px - (width - 1) / 2, judged.v_px - (height - 1) / 2)
-        off = math.inf if math.isnan(off_px) else 2 * off_px / width
-        self._before, self._potential = self._potential, float(closeness(off, judged.size_ratio))
+        self._before, self._potential = self._potential, closeness_of(judged)
         return judged
 
     def _reward(self, judged: Closeup, is_new: bool) -> float:
-        if self.reward == "dense":
-            return self._potential
-        earned = super()._reward(judged, is_new)
-        if self.reward == "yield":
-            return earned
-        return float(shaped(earned, self.gamma, self._before, self._potential))
+        return self._paid(super()._reward(judged, is_new), self._commanded_before, self._commanded)
 
     def _observe(self) -> Any:
         self._features = self._task_features()

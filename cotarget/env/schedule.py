@@ -1,7 +1,7 @@
 """`cotarget/Schedule-v0`: choose which of several targets to follow; the pipeline does the rest."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,11 @@ CANDIDATE_FEATURES = {
     "seen": (0.0, 1.0),  # time well in the close-up, as a part of the time for which policies look at each
     "reachable": (0.0, 1.0),  # whether the head can point at it
 }
+
+
+def is_served(good_s: float) -> bool:
+    """Whether a target was well in the close-up for long enough [s]."""
+    return good_s >= SERVED_S - ROUNDING_S
 
 
 class ActionSelector:
@@ -103,6 +108,8 @@ class Schedule(RigEnv[dict[str, Any], int]):
     (5, 3); and the number of `served` targets.
     """
 
+    _features: Mapping[str, tuple[float, float]] = CANDIDATE_FEATURES  # of a slot
+
     def __init__(
         self,
         kind: str = "person",
@@ -136,9 +143,9 @@ class Schedule(RigEnv[dict[str, Any], int]):
         check_scene(self.config.sim, kind, group_paths)
         require(number_in(served_reward, -math.inf, math.inf), "served_reward", served_reward, "a finite number")
         self.target, self._served_reward = self.profile_of(kind), float(served_reward)
-        self._rig_space, self._track_space = box(RIG_FEATURES.values()), box(CANDIDATE_FEATURES.values(), SLOTS)
+        self._rig_space, self._track_space = box(RIG_FEATURES.values()), box(self._features.values(), SLOTS)
         self.action_space = gymnasium.spaces.Discrete(SLOTS)  # type: ignore[assignment]  # its numbers are numpy's
-        pictures = self._picture_spaces() if observation == "images" else {}
+        pictures = {} if observation == "tracks" else self._picture_spaces()
         self.observation_space = gymnasium.spaces.Dict(
             {"tracks": self._track_space, "rig": self._rig_space, **pictures}
         )
@@ -196,17 +203,21 @@ class Schedule(RigEnv[dict[str, Any], int]):
         self.episode  # noqa: B018  raises if there is none
         require(self.action_space.contains(action), "action", action, f"the number of a slot, 0 to {SLOTS - 1}")
         self._selector.number = self._slots[action]
-        before = self._step.zoom.t
+        before = self._step
         self._index += 1
         self._turn()
-        passed, good = self._step.zoom.t - before, self._good()
-        reward = 0.0
+        good = self._good()
+        reward = self._reward(before, good)
+        return self._observe(), reward, False, self._index >= self.frames, self._info(good)
+
+    def _reward(self, before: Step, good: Mapping[str, bool]) -> float:
+        """Count the time since the zoom frame of the step before for the good targets; return the reward."""
+        passed, reward = self._step.zoom.t - before.zoom.t, 0.0
         before_served = self._served()
         for name, well in good.items():
             self._good_s[name] += passed * well
             reward += passed * well
-        reward += self._served_reward * (self._served() - before_served)
-        return self._observe(), reward, False, self._index >= self.frames, self._info(good)
+        return reward + self._served_reward * (self._served() - before_served)
 
     def _end(self) -> None:
         """Close the episode and its pipeline."""
@@ -229,7 +240,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
 
     def _served(self) -> int:
         """Number of targets that were well in the close-up for long enough."""
-        return sum(seconds >= SERVED_S - ROUNDING_S for seconds in self._good_s.values())
+        return sum(map(is_served, self._good_s.values()))
 
     def _observe(self) -> dict[str, Any]:
         step = self._step
@@ -238,12 +249,12 @@ class Schedule(RigEnv[dict[str, Any], int]):
         candidates = {candidate.id: candidate for candidate in self.candidates}
         rows = [self._candidate_numbers(candidates.get(number or 0)) for number in self._slots]
         seen = {"tracks": within(rows, self._track_space), "rig": within(numbers, self._rig_space)}
-        return {**seen, **self._pictures()} if self._observation == "images" else seen
+        return seen if self._observation == "tracks" else {**seen, **self._pictures()}
 
     def _candidate_numbers(self, candidate: Candidate | None) -> list[float]:
         """Compute the CANDIDATE_FEATURES of a candidate; zeros for an empty slot."""
         if candidate is None:
-            return [0.0] * len(CANDIDATE_FEATURES)
+            return [0.0] * len(self._features)
         followed = self._step.target is not None and self._step.target.id == candidate.id
         (at_pan, at_tilt), shortest_px = candidate.at.tolist(), self.units.focal_px[0]
         pan, tilt, _ = self.units.numbers(at_pan, at_tilt, shortest_px)

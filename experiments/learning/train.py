@@ -35,7 +35,6 @@ PPO_SETTINGS: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.0},
 }
 CLONE_STEPS, CLONE_ROUNDS, CLONE_BATCH = 250, 1500, 4096
-CLONE_LOG_STD = -2.0  # of a policy that is good already
 RESIDUAL_GAIN = 0.01  # of the last layer, so that a residual begins near 0
 
 
@@ -78,8 +77,6 @@ def clone(model: Any, env: VecNormalize, rng: np.random.Generator) -> None:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    with torch.no_grad():
-        model.policy.log_std.fill_(CLONE_LOG_STD)
     print(f"# cloned {len(inputs)} actions to an rms error of {loss.item() ** 0.5:.3f}", flush=True)
 
 

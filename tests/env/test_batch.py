@@ -112,6 +112,24 @@ def test_it_does_what_the_single_environment_does(tmp_path, field, action):
     many.close()
 
 
+@pytest.mark.parametrize("action", ["rates", "absolute"])
+def test_wear_costs_what_it_costs_in_the_single_environment(field, action):
+    """A book, which a zoomed-out camera does not see at the wanted size, so that the yield is 0."""
+    arguments = {"target": "book", "action": action, "reward": "yield", "wear": 0.1, "rig": field, "seconds": 2.0}
+    env, many, told = FollowV1(**arguments), batch(2, **arguments), []
+    env.reset(seed=0)
+    many.reset(seed=0)
+    for given in np.random.default_rng(0).uniform(-0.2, 0.1, (20, 3)).astype(np.float32):
+        told.append([-env.step(given)[1], *(-many.step(np.tile(given, (2, 1)))[1])])
+    alone, first, second = np.transpose(told)
+    np.testing.assert_array_equal(first, second)
+    # A head's command may be rounded to the next step, of 0.02 half-widths at the longest focal length of these.
+    np.testing.assert_allclose(first, alone, atol=0.1 * 0.02)
+    assert alone.max() > 0.1
+    env.close()
+    many.close()
+
+
 @pytest.mark.parametrize(("target", "seeds"), [("person", 4), ("bird", 8)])  # birds' paths differ more
 def test_it_scores_as_the_single_environment(field, target, seeds):
     """With noise, and a track that is simpler than the tracker."""

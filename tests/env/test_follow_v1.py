@@ -1,6 +1,7 @@
 """cotarget/Follow-v1: aims, features, actions and rewards, what varies between episodes, and targets of one's own."""
 
 import dataclasses
+import itertools
 import math
 
 import gymnasium
@@ -156,6 +157,32 @@ def test_shaping_adds_the_difference_of_two_potentials_to_the_return(field):
     assert sums["yield"] > 1
 
 
+@pytest.mark.parametrize("reward", ["dense", "yield"])
+def test_wear_costs_the_way_from_command_to_command(field, reward):
+    """In absolute actions: pan and tilt over half-widths of 320 px, focal lengths in tenths; worked by hand."""
+    rng, wear, told = np.random.default_rng(0), 0.05, []
+    actions = rng.uniform(-0.2, 0.2, (20, 3)).astype(np.float32)
+    for cost in (0.0, wear):
+        env = FollowV1("book", "absolute", reward, wear=cost, rig=field, seconds=2.0)
+        env.reset(seed=0)
+        told.append([env.step(action)[1] for action in actions])
+        units, step_rad = env.units, env.episode.rig.head.limits.pan.step
+        env.close()
+    commands = [np.array([0.0, 0.0, units.focal_px[0]]), *(np.array(units.command(action)) for action in actions)]
+    for k, (before, after) in enumerate(itertools.pairwise(commands)):
+        turned = np.abs(after - before)[:2].sum() / (320 / after[2])
+        zoomed = abs(math.log(after[2] / before[2])) / 0.1
+        # Commands are rounded to steps of the head and to positions of the lens, 0.019 apart in the logarithm.
+        rounding = wear * (2 * step_rad / (320 / after[2]) + 0.019 * (turned + 1 / 0.1))
+        assert told[0][k] - told[1][k] == pytest.approx(wear * (turned + zoomed), abs=rounding)
+
+
+def test_a_head_that_stands_does_not_wear(field):
+    env = FollowV1("bird", reward="yield", wear=1.0, rig=field, seconds=2.0)
+    assert [reward for _, reward, _ in run(env, lambda _: STILL, seed=0)] == [0.0] * 51
+    env.close()
+
+
 def best_actions(rewards, after, gamma, ends):
     """The best actions of each state of a small decision process, by value iteration."""
     values = np.zeros(len(rewards))
@@ -238,6 +265,8 @@ def test_a_target_and_a_rig_of_ones_own_by_rig_toml(tmp_path):
     (lambda: FollowV1(action="jump"), "action: 'jump'"),
     (lambda: FollowV1(reward="praise"), "reward: 'praise'"),
     (lambda: FollowV1(gamma=1.5), "gamma: 1.5"),
+    (lambda: FollowV1(wear=-0.1), "wear: -0.1"),
+    (lambda: FollowV1(wear="much"), "wear: 'much'"),
     (lambda: FollowV1(randomize=3), "randomize: 3"),
     (lambda: FollowV1(randomize=Randomization(delay=-1.0)), "randomize.delay: -1.0"),
     (lambda: PipelinePolicy(FollowV1()), "env: the pipeline's actions are 'absolute'"),

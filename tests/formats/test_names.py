@@ -31,6 +31,7 @@ from cotarget.env import SchedulingPolicy
 from cotarget.env.common import RIG_FEATURES
 from cotarget.env.follow import TRACK_FEATURES
 from cotarget.env.schedule import CANDIDATE_FEATURES
+from cotarget.env.schedule_v1 import SLOT_FEATURES
 from cotarget.errors import ConfigError
 from cotarget.geometry import pose
 from cotarget.schema import as_table
@@ -358,7 +359,8 @@ def test_board_presenter_gets_the_listed_requests():
 
 
 # --- environments ---
-FOLLOW, FOLLOW_V1, SCHEDULE = "cotarget/Follow-v0", "cotarget/Follow-v1", "cotarget/Schedule-v0"
+FOLLOW, FOLLOW_V1 = "cotarget/Follow-v0", "cotarget/Follow-v1"
+SCHEDULE, SCHEDULE_V1 = "cotarget/Schedule-v0", "cotarget/Schedule-v1"
 
 
 def span(space, where, names=None):
@@ -398,10 +400,11 @@ FEATURES = {
     FOLLOW: {f"{FOLLOW} observation": [*TRACK_FEATURES, *RIG_FEATURES], "rig": [*RIG_FEATURES]},
     FOLLOW_V1: {f"{FOLLOW_V1} observation": [*TASK_FEATURES], "rig": [*RIG_FEATURES], "tracks": [*TASK_FEATURES]},
     SCHEDULE: {"tracks[]": [*CANDIDATE_FEATURES], "rig": [*RIG_FEATURES]},
+    SCHEDULE_V1: {"tracks[]": [*SLOT_FEATURES], "rig": [*RIG_FEATURES]},
 }
 
 
-@pytest.mark.parametrize("name", [FOLLOW, FOLLOW_V1, SCHEDULE])
+@pytest.mark.parametrize("name", [FOLLOW, FOLLOW_V1, SCHEDULE, SCHEDULE_V1])
 def test_an_environment_is_as_listed(name):
     with contextlib.closing(gymnasium.make(f"cotarget.env:{name}")) as env:
         lines = [
@@ -410,7 +413,7 @@ def test_an_environment_is_as_listed(name):
         ]
         observation, info = env.reset(seed=3)
         assert env.observation_space.contains(observation)
-        action = 0 if name == SCHEDULE else np.zeros(3, np.float32)
+        action = 0 if name in (SCHEDULE, SCHEDULE_V1) else np.zeros(3, np.float32)
         _, reward, terminated, truncated, after = env.step(action)
         assert (type(reward), terminated, truncated) == (float, False, False)
         assert info.keys() == after.keys()
@@ -422,7 +425,9 @@ def test_an_environment_is_as_listed(name):
             with pytest.raises(ConfigError) as caught:
                 SchedulingPolicy(env, UNKNOWN)
             assert_listed("policies.txt", last_list(str(caught.value)))
-    with contextlib.closing(gymnasium.make(name, observation="both" if name == FOLLOW_V1 else "images")) as env:
+    with contextlib.closing(
+        gymnasium.make(name, observation="both" if name in (FOLLOW_V1, SCHEDULE_V1) else "images")
+    ) as env:
         lines += span(env.observation_space, f"{name} images", FEATURES[name])
     assert_listed("environments.txt", lines, begins=name)
 

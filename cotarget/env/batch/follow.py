@@ -28,9 +28,10 @@ from cotarget.env.batch.motion import JUMP, Plans
 from cotarget.env.batch.optics import Closeups, ZoomCameras
 from cotarget.env.batch.tracks import Flags, Tracks
 from cotarget.env.common import DETECTOR_NOISE, number_in, require
-from cotarget.env.follow_v1 import GAMMA, Action, FollowV1
-from cotarget.env.rewards import Reward, closeness, shaped
+from cotarget.env.follow_v1 import Action, FollowV1
+from cotarget.env.rewards import Reward, closeness, commanded_way, shaped
 from cotarget.env.variation import LARGEST_FACTOR, Randomization, Variation
+from cotarget.env.version1 import GAMMA
 from cotarget.errors import ConfigError
 from cotarget.evaluation import TruthNoise, true_calibration
 from cotarget.geometry import Array
@@ -68,6 +69,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         reward: Reward = "dense",
         observation: str = "tracks",
         gamma: float = GAMMA,
+        wear: float = 0.0,
         randomize: Randomization | bool | None = None,
         rig: RigConfig | Path | str | None = None,
         calibration: Calibration | Path | str | None = None,
@@ -85,6 +87,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
             reward: "yield", "dense" or "shaped".
             observation: "tracks"; a batch renders nothing.
             gamma: discount of the learner, for the reward "shaped".
+            wear: cost of a unit of commanded motion.
             randomize: ranges of what differs between episodes; paths are shifted when they are prepared.
             rig: a simulated rig or its rig.toml.
             calibration: calibration that features use, or its file; the true one by default.
@@ -103,7 +106,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
             raise ConfigError("observation: a batch has observation='tracks' alone, and no render_mode")
         # The single environment checks the arguments.
         self.single = FollowV1(
-            target, action, reward, "tracks", gamma, randomize, rig, calibration, seconds, noise=noise
+            target, action, reward, "tracks", gamma, wear, randomize, rig, calibration, seconds, noise=noise
         )
         self.num_envs, self._noise, self.frames = num_envs, noise, self.single.frames
         self.config, self.target = self.single.config, self.single.target
@@ -171,8 +174,8 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         head, effects = self.config.sim.head, self.config.sim.effects
         self._play = math.radians(head.backlash_deg) / 2 if effects.backlash else 0.0
         self._driven, self._half_width = np.zeros((2, count)), np.zeros(count)
-        # Logarithms of the focal length that was last commanded, before and after rounding to positions.
-        self._focal, self._commanded = np.full((2, count), self._log_focal)
+        # The last command, its focal length as a logarithm; and that before rounding to positions.
+        self._commanded, self._focal = np.zeros((3, count)), np.full(count, self._log_focal)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -222,6 +225,8 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         self._detect()
         seen = self._closeups(self._driven, shown[LENS], slice(None))
         reward = self._rewards(seen, self._zoom_k > zoom_before)
+        if self.single.wear:
+            reward = reward - self._worn
         self._features = self._observe(now, present[LENS])
         truncated = self._k >= self.frames
         infos = {"good": seen.good, "_good": np.ones(self.num_envs, bool)}
@@ -263,7 +268,8 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         self._plans.restart(which, at_rest)
         self._tracks.end(np.isin(np.arange(self.num_envs), which))
         self._driven[:, which] = 0.0
-        self._focal[which] = self._commanded[which] = self._log_focal
+        self._commanded[PAN_TILT, which] = 0.0
+        self._focal[which] = self._commanded[LENS, which] = self._log_focal
         self._features[which] = 0.0  # there is no track, and nothing moves
         shortest = np.full(len(which), self._log_focal)
         self._half_width[which] = self._solver.half_width(shortest) / self._varied["focal"][which]
@@ -305,7 +311,10 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         goal[LENS] = (focal - self._log_focal) / self._log_step
         goal = np.clip(goal, self._low, self._high)
         goal = np.where(self._step > 0, np.rint(goal / self._divisor) * self._step, goal)
-        self._commanded = self._log_focal + goal[LENS] * self._log_step
+        before, self._commanded = self._commanded, goal.copy()
+        self._commanded[LENS] = self._log_focal + goal[LENS] * self._log_step
+        if self.single.wear:
+            self._worn = self.single.wear * commanded_way(before, self._commanded, self.config.sim.zoom.size[0])
         self._plans.command(effect_t, motion, goal, speed)
 
     def _detect(self) -> None:
@@ -361,6 +370,6 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         command = np.empty_like(aim[:, 0])
         command[PAN_TILT] = 2 * (aim[PAN_TILT, 0] - low) / (high - low) - 1
         command[LENS] = 2 * (aim[LENS, 0] - self._log_focal) / (self._log_step * self._drive.last) - 1
-        there = Situation(x[PAN_TILT], v[PAN_TILT], self._commanded, focal, self._half_width, self._interval)
+        there = Situation(x[PAN_TILT], v[PAN_TILT], self._commanded[LENS], focal, self._half_width, self._interval)
         known = tracks.confirmed.astype(float)
         return task_features(aim[:, 0], aim[:, 1], command, known, tracks.unseen_s, there)
