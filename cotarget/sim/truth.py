@@ -307,7 +307,7 @@ class Truth:
         """
         own = self._surfaces[name].geoms
         hit, _ = _first_hits(self.model, data, eye, data.geom_xpos[own] - eye)
-        return float(np.isin(hit, own).mean())
+        return float((hit[:, None] == own).any(axis=1).mean())  # np.isin takes ten times as long for so few
 
 
 def _shown(x_camera: Array, direction: Array, lens: TrueLens) -> Array:
