@@ -171,6 +171,30 @@ def test_it_resets_itself_and_the_same_seed_gives_the_same_episodes(field):
     many.close()
 
 
+def test_with_next_step_resets_it_does_what_gymnasiums_vectors_do_and_takes_their_wrappers(field):
+    """Beside gymnasium's own vector of single environments: flags, rewards of 0 and first observations are the same."""
+    arguments = {"num_envs": 2, "rig": field, "seconds": 0.4}
+    ours = batch(autoreset_mode="NextStep", **arguments)
+    theirs = gymnasium.make_vec("cotarget.env:cotarget/Follow-v1", vectorization_mode="sync", **arguments)
+    assert ours.metadata["autoreset_mode"] is theirs.metadata["autoreset_mode"]
+    wrapped = gymnasium.wrappers.vector.FlattenObservation(ours)  # as all that change observations, for NextStep alone
+    for vector in (wrapped, theirs):
+        vector.reset(seed=0)
+    for k in range(1, 25):
+        found, told = (vector.step(np.full((2, 3), 0.5, np.float32)) for vector in (wrapped, theirs))
+        assert found[0].shape == told[0].shape
+        np.testing.assert_array_equal(found[3], told[3])
+        assert (found[3][0], found[4].keys()) == (k % 11 == 10, {"good", "_good"})
+        if k % 11 == 0:  # the reset, to a new episode at rest
+            np.testing.assert_array_equal(found[1], told[1])
+            assert not found[1].any()
+            np.testing.assert_array_equal(found[0], told[0])
+        else:
+            assert (found[1] > 0).all()
+    wrapped.close()
+    theirs.close()
+
+
 def test_shaping_telescopes_in_each_environment(field):
     gamma, sums = 0.9, {}
     for reward in ("yield", "shaped", "dense"):
@@ -207,6 +231,7 @@ def test_options_set_what_randomize_draws(field):
 @pytest.mark.parametrize(("make", "named"), [
     (lambda: FollowBatch(0), "num_envs: 0"),
     (lambda: FollowBatch(2, paths=0), "paths: 0"),
+    (lambda: FollowBatch(2, autoreset_mode="Disabled"), "autoreset_mode: 'Disabled'"),
     (lambda: FollowBatch(2, observation="images"), "observation: "),
     (lambda: FollowBatch(2, target="dragon"), "target: 'dragon'"),
 ])  # fmt: skip

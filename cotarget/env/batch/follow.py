@@ -27,7 +27,7 @@ from cotarget.env.batch.appearance import Appearance, Stage
 from cotarget.env.batch.motion import JUMP, Plans
 from cotarget.env.batch.optics import Closeups, ZoomCameras
 from cotarget.env.batch.tracks import Flags, Tracks
-from cotarget.env.common import DETECTOR_NOISE, number_in, require
+from cotarget.env.common import DETECTOR_NOISE, number_in, one_of, require
 from cotarget.env.follow_v1 import Action, FollowV1
 from cotarget.env.rewards import Reward, closeness, commanded_way, shaped
 from cotarget.env.variation import LARGEST_FACTOR, Randomization, Variation
@@ -47,9 +47,10 @@ Ints = npt.NDArray[np.intp]
 class FollowBatch(VectorEnv[Any, Any, Any]):
     """`cotarget.env.FollowV1` with features, many times.
 
-    An episode is truncated by itself after its seconds, and the next one begins in the same step: the observation is
-    the first of the new episode, and `infos["final_obs"]` has the last of the old one where `infos["_final_obs"]` is
-    true. `infos["good"]` says whether the newest zoom frame is a good close-up.
+    All episodes are truncated by themselves after their seconds. With the autoreset mode "SameStep" the next ones begin
+    in the same step: the observation is the first of the new episode, and `infos["final_obs"]` has the last of the old
+    one where `infos["_final_obs"]` is true. With "NextStep" they begin in the next step, whose actions are ignored and
+    whose rewards are 0. `infos["good"]` says whether the newest zoom frame is a good close-up.
 
     Paths and sizes are drawn from some that are prepared when they are first met; noise, misses and variations are new
     in each episode. The first frame of an episode is not detected.
@@ -76,6 +77,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         seconds: float = SECONDS,
         noise: TruthNoise = DETECTOR_NOISE,
         paths: int = PATHS,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
     ) -> None:
         """Create the environments.
@@ -94,6 +96,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
             seconds: length of an episode, at most 20 [s].
             noise: noise of the detections.
             paths: number of paths that are prepared.
+            autoreset_mode: gymnasium's "SameStep" or "NextStep".
             render_mode: None.
 
         Raises:
@@ -102,6 +105,9 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         for name, value in (("num_envs", num_envs), ("paths", paths)):
             whole = isinstance(value, int) and number_in(value, 0, math.inf)
             require(whole, name, value, "a whole number from 1 on")
+        modes = {mode.value: mode for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)}
+        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        self._autoreset = modes[one_of("autoreset_mode", mode, modes)]
         if observation != "tracks" or render_mode is not None:
             raise ConfigError("observation: a batch has observation='tracks' alone, and no render_mode")
         # The single environment checks the arguments.
@@ -119,7 +125,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.render_mode = None
         self.metadata = {
-            "autoreset_mode": AutoresetMode.SAME_STEP,
+            "autoreset_mode": self._autoreset,
             "render_modes": [],
             "render_fps": self.config.sim.fixed.rate_hz,
         }
@@ -199,7 +205,7 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
         self._plans = Plans(math.ceil(in_flight_s / self._interval) + 3, self._rises, np.zeros((3, self.num_envs)))
         self._features = np.zeros((self.num_envs, len(TASK_FEATURES)), np.float32)
         good = self._begin(np.arange(self.num_envs), options)
-        return self._features.copy(), {"good": good, "_good": np.ones(self.num_envs, bool)}
+        return self._features.copy(), self._infos(good)
 
     def step(self, actions: Numbers) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Command heads and lenses, and go to the next frame of the fixed cameras.
@@ -216,6 +222,14 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
             given = np.empty(0)
         fits = given.shape == (self.num_envs, 3) and bool(np.isfinite(given).all())
         require(fits, "actions", actions, f"three finite numbers for each of {self.num_envs} environments")
+        if self._k[0] >= self.frames:  # all episodes are as long
+            good = self._begin(np.arange(self.num_envs))
+            return (
+                self._features.copy(),
+                np.zeros(self.num_envs),
+                *np.zeros((2, self.num_envs), bool),
+                self._infos(good),
+            )
         self._command(given, self._now() + self._varied["delay"] * self._delay_s)
         self._k += 1
         now, zoom_before = self._now(), self._zoom_k
@@ -229,11 +243,15 @@ class FollowBatch(VectorEnv[Any, Any, Any]):
             reward = reward - self._worn
         self._features = self._observe(now, present[LENS])
         truncated = self._k >= self.frames
-        infos = {"good": seen.good, "_good": np.ones(self.num_envs, bool)}
-        if truncated.any():
+        infos = self._infos(seen.good)
+        if truncated.any() and self._autoreset is AutoresetMode.SAME_STEP:
             infos |= {"final_obs": self._features.copy(), "_final_obs": truncated}
             self._begin(np.flatnonzero(truncated))
         return self._features.copy(), reward, np.zeros(self.num_envs, bool), truncated, infos
+
+    def _infos(self, good: Flags) -> dict[str, Any]:
+        """Infos of all environments."""
+        return {"good": good, "_good": np.ones(self.num_envs, bool)}
 
     def _now(self) -> Array:
         """Times at which the newest fixed frames have come [s], (n,)."""
