@@ -17,23 +17,25 @@ import numpy as np
 
 from cotarget.control.policy import OnnxPolicy, proportional
 from cotarget.env import FOLLOW_V1, PipelinePolicy
+from cotarget.errors import ConfigError
 
 FIRST_SEED, SEEDS = 1000, 50  # held out from training, whose paths have other seeds
 Policy = Callable[[Any], Any]
 
 
-def score(target: str, policy: str, seeds: range, file: Path | None = None) -> list[float]:
+def score(target: str, policy: str, seeds: range, file: Path | None = None, rig: Path | None = None) -> list[float]:
     """Score a policy in each episode.
 
     Args:
-        target: book, person or bird.
+        target: book, person or bird, or one with a path in the rig's file.
         policy: "pipeline", "proportional", or "file".
         seeds: seeds of the episodes.
         file: the policy's file.
+        rig: a rig.toml; None for the environment's own rig.
     """
     learnt = None if file is None else OnnxPolicy(file)
     action = "absolute" if policy == "pipeline" else "rates" if learnt is None else learnt.action
-    env = gymnasium.make(FOLLOW_V1, target=target, action=action, reward="yield")
+    env = gymnasium.make(FOLLOW_V1, target=target, action=action, reward="yield", rig=rig)
     act: Policy = learnt if learnt is not None else PipelinePolicy(env) if policy == "pipeline" else proportional
     scores = []
     for seed in seeds:
@@ -51,16 +53,26 @@ def main() -> None:
     """Print scores as JSON: means and paired differences to the pipeline, with half of their 95 % intervals."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", nargs="*", type=Path, help="policies; without, the proportional controller")
-    parser.add_argument("--target", default="bird", choices=("book", "person", "bird"))
-    parser.add_argument("--seeds", type=int, default=SEEDS, help=f"number of episodes, from seed {FIRST_SEED} on")
+    parser.add_argument("--target", default="bird", help="book, person, bird, or one of the rig's own")
+    parser.add_argument("--rig", type=Path, help="a rig.toml; without, the environment's own rig")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="number of episodes, 2 at least")
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="seed of the first one")
     options = parser.parse_args()
-    seeds = range(FIRST_SEED, FIRST_SEED + options.seeds)
-    pipeline = np.array(score(options.target, "pipeline", seeds))
-    print(json.dumps({"pipeline": mean_of(pipeline)}))
-    for file in options.files or [None]:
-        found = np.array(score(options.target, "proportional" if file is None else "file", seeds, file))
-        ahead = mean_of(found - pipeline)
-        print(json.dumps({str(file or "proportional"): {**mean_of(found), "ahead": ahead}}))
+    if options.seeds < 2 or options.first_seed < 0:
+        parser.error("--seeds is 2 at least, and --first-seed 0 at least")
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    try:
+        for file in options.files:
+            OnnxPolicy(file)  # a wrong file is refused before the episodes of the pipeline
+        pipeline = np.array(score(options.target, "pipeline", seeds, rig=options.rig))
+        print(json.dumps({"pipeline": mean_of(pipeline)}), flush=True)
+        for file in options.files or [None]:
+            policy = "proportional" if file is None else "file"
+            found = np.array(score(options.target, policy, seeds, file, options.rig))
+            ahead = mean_of(found - pipeline)
+            print(json.dumps({str(file or "proportional"): {**mean_of(found), "ahead": ahead}}), flush=True)
+    except ConfigError as error:
+        parser.error(str(error))
 
 
 def mean_of(values: np.ndarray[Any, Any]) -> dict[str, float]:

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cotarget.control.policy import TASK_FEATURES, proportional
 from cotarget.env.batch import FollowBatch
+from cotarget.errors import ConfigError
 from experiments.learning.onnx_policy import write_policy
 from experiments.learning.vec_env import BatchVecEnv
 
@@ -92,9 +93,11 @@ def export(model: Any, env: VecNormalize, path: Path, action: str) -> None:
 def main() -> None:
     """Train and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--target", default="bird", choices=("book", "person", "bird"))
+    parser.add_argument("--target", default="bird", help="book, person, bird, or one of the rig's own")
+    parser.add_argument("--rig", type=Path, help="a rig.toml; without, the environment's own rig")
     parser.add_argument("--action", default="rates", choices=("rates", "residual"))
     parser.add_argument("--reward", default="dense", choices=("dense", "shaped", "yield"))
+    parser.add_argument("--wear", type=float, default=0.0, help="cost of a unit of commanded motion")
     parser.add_argument("--start", default="scratch", choices=("scratch", "clone"))
     parser.add_argument("--randomize", action="store_true", help="vary delays, noise, lens and calibration")
     parser.add_argument("--steps", type=int, default=STEPS, help="of all environments together")
@@ -104,14 +107,13 @@ def main() -> None:
     if options.start == "clone" and options.action == "residual":
         parser.error("--start clone: the clone has the action 'rates'; a residual begins at the aim by itself")
     torch.set_num_threads(1)
-    batch = FollowBatch(
-        NUM_ENVS,
-        options.target,
-        options.action,
-        options.reward,
-        gamma=PPO_SETTINGS["gamma"],
-        randomize=options.randomize,
-    )
+    given: dict[str, Any] = {
+        name: getattr(options, name) for name in ("target", "action", "reward", "wear", "randomize", "rig")
+    }
+    try:
+        batch = FollowBatch(NUM_ENVS, gamma=PPO_SETTINGS["gamma"], **given)
+    except ConfigError as error:
+        parser.error(str(error))
     env = BatchVecEnv(batch)
     normalized = VecNormalize(env, norm_reward=False, clip_obs=CLIP)
     model = PPO("MlpPolicy", normalized, seed=options.seed, device="cpu", **PPO_SETTINGS)
