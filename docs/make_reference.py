@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cotarget.backends import check
-from cotarget.cli.main import make_parser
+from cotarget.cli.main import COMMANDS, make_parser
 from cotarget.config import DEFAULT_TARGETS, HardwareConfig, RigConfig, parse_config
 from cotarget.drivers import DRIVERS
 from cotarget.drivers.board import BoardSettings
@@ -145,7 +145,7 @@ def command_line() -> str:
     """Describe every command and its arguments."""
     commands = next(a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
     parts = []
-    for name, parser in commands.items():
+    for name, parser in ((name, commands[name]) for name in COMMANDS):
         parser.formatter_class = partial(argparse.HelpFormatter, width=96)
         parts += [_heading(f"cotarget {name}", name), f"{parser.description[:1].upper()}{parser.description[1:]}.\n"]
         parts.append(f"```text\n{parser.format_usage()}```\n".replace("usage: ", "").replace("\n       ", "\n"))

@@ -154,9 +154,10 @@ def _notes(end: BaseException) -> list[str]:
 DESCRIPTION = "A fixed camera finds a small target; a zoom camera on a pan-tilt head shows it large."
 # In an order of use. Each has a module, whose docstring is the help; `add` adds the options, and `run` runs it.
 COMMANDS = (
-    "demo", "config", "doctor", "view", "board", "where", "point", "home", "learn", "latency", "calibrate", "report",
-    "aim", "follow", "replay", "detect", "stop", "clear", "reset-head", "emulate",
+    "demo", "config", "doctor", "view", "board", "where", "point", "home", "characterize", "latency", "calibrate",
+    "report", "aim", "follow", "replay", "detect", "stop", "clear", "reset-head", "emulate",
 )  # fmt: skip
+EARLIER = {"learn": "characterize"}  # names that commands had
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -173,5 +174,7 @@ def make_parser() -> argparse.ArgumentParser:
         made.add_argument("-v", "--verbose", action="store_true", help="report more of what is done")
         made.set_defaults(run=command.run)
         command.add(made)
-    parser.example = "\n         ".join(made.example for made in commands.choices.values())
+    for earlier, name in EARLIER.items():
+        commands.choices[earlier] = commands.choices[name]  # understood, and not listed
+    parser.example = "\n         ".join(commands.choices[name].example for name in COMMANDS)
     return parser

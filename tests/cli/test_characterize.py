@@ -1,11 +1,11 @@
-"""The command that learns a dome: its question, and what it prints of what was learnt."""
+"""The command that characterizes a dome: its question, and what it prints."""
 
 import tomllib
 
 import pytest
 
-from cotarget import bringup
-from cotarget.bringup import ZOOM_STEPS, Learnt
+from cotarget import characterization
+from cotarget.characterization import ZOOM_STEPS, Characteristics
 from tests.support.commands import HARDWARE, call
 from tests.support.onvif_dome import OnvifUnit
 from tests.support.plants import FEED_SIZE, PASSWORD, USER
@@ -39,10 +39,10 @@ lens = [[0, 1], [1, 10]]
         yield unit
 
 
-def test_what_was_learnt_becomes_keys(dome, capsys, monkeypatch):
+def test_what_was_measured_becomes_keys(dome, capsys, monkeypatch):
     """By hand: pan counts the other way and 1.2 times as far; 320 px over 2 x 200 px are 77.3 degrees."""
     growths = tuple((277.13 * 10 ** (i / ZOOM_STEPS), 8.0 ** (i / ZOOM_STEPS)) for i in range(ZOOM_STEPS + 1))
-    learnt = Learnt(
+    found = Characteristics(
         moves=True,
         orientation="upright",
         scale=(-1.2, 1.01),
@@ -55,8 +55,8 @@ def test_what_was_learnt_becomes_keys(dome, capsys, monkeypatch):
         growths=growths,
         speeds=((1.0, 1.0), (1.5, 0.9), (2.5, 0.3), (4.0, 0.29), (6.0, 0.1)),
     )
-    monkeypatch.setattr(bringup, "learn", lambda *arguments: learnt)
-    status, out, err = call(capsys, "learn", "--rig", dome.file, "--yes")
+    monkeypatch.setattr(characterization, "characterize", lambda *arguments: found)
+    status, out, err = call(capsys, "characterize", "--rig", dome.file, "--yes")
     assert status == 0, err
     keys = tomllib.loads(out)["hardware"]["ptz"]
     assert keys["pan_sign"] == -1
@@ -77,22 +77,22 @@ def test_nothing_moves_without_consent(dome, capsys, monkeypatch, tmp_path, answ
     (tmp_path / "answer").write_text(answer or "")
     with (tmp_path / "answer").open() as said:
         monkeypatch.setattr("sys.stdin", said)
-        status, out, err = call(capsys, "learn", "--rig", dome.file)
+        status, out, err = call(capsys, "characterize", "--rig", dome.file)
     assert status == 1
-    assert "not learnt; it needs the answer yes, or --yes" in err
+    assert "nothing was turned; it needs the answer yes, or --yes" in err
     assert "degrees of pan" in out
     assert "AbsoluteMove" not in dome.moves
 
 
 def test_a_dome_whose_picture_does_not_move_is_named(dome, capsys, monkeypatch):
-    monkeypatch.setattr(bringup, "learn", lambda *arguments: Learnt(moves=False))
-    status, out, err = call(capsys, "learn", "--rig", dome.file, "--yes")
+    monkeypatch.setattr(characterization, "characterize", lambda *arguments: Characteristics(moves=False))
+    status, out, err = call(capsys, "characterize", "--rig", dome.file, "--yes")
     assert (status, out) == (1, "")
     assert "write absolute = false into [hardware.ptz]" in err
 
 
 def test_a_head_that_is_no_dome_is_refused(tmp_path, capsys):
     (tmp_path / "rig.toml").write_text(HARDWARE)
-    status, _, err = call(capsys, "learn", "--rig", tmp_path / "rig.toml", "--yes")
+    status, _, err = call(capsys, "characterize", "--rig", tmp_path / "rig.toml", "--yes")
     assert status == 1
     assert "cotarget latency" in err

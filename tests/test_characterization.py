@@ -1,11 +1,11 @@
-"""A dome is learnt from its picture: a textured sphere in simulated time, and facts that are drawn by seed."""
+"""A dome is characterized by its picture: a textured sphere in simulated time, and facts that are drawn by seed."""
 
 import math
 
 import numpy as np
 import pytest
 
-from cotarget.bringup import fit_pictures, growth_of, learn, orientation_of, room_of, start_of_turns
+from cotarget.characterization import characterize, fit_pictures, growth_of, orientation_of, room_of, start_of_turns
 from tests.support.rigs import rig_of
 from tests.support.textured_dome import LATENCY_S, LONGEST, SIZE, WIDE_PX, TexturedDome
 
@@ -21,9 +21,9 @@ def grey(dome, pan_deg, tilt_deg, focal=WIDE_PX):
     return dome.picture(math.radians(pan_deg), math.radians(tilt_deg), focal)[:, :, 0]
 
 
-def learnt(dome):
+def characterized(dome):
     rig = rig_of(dome)
-    return learn(rig, room_of(rig), lambda line: None)
+    return characterize(rig, room_of(rig), lambda line: None)
 
 
 def drawn(seed):
@@ -46,9 +46,9 @@ def drawn(seed):
 
 # The whole of it is 40 s of pictures; one seed runs always.
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 9))])
-def test_what_a_dome_does_is_learnt_from_its_picture(seed):
+def test_what_a_dome_does_is_measured_in_its_picture(seed):
     dome = drawn(seed)
-    found = learnt(dome)
+    found = characterized(dome)
     assert found.moves
     words = (["upside down"] if dome.upside_down else []) + (["mirrored"] if dome.mirrored else [])
     assert found.orientation == (" and ".join(words) or "upright")
@@ -72,7 +72,7 @@ def test_what_a_dome_does_is_learnt_from_its_picture(seed):
 
 
 def test_a_dome_that_does_not_move_is_found_out():
-    assert not learnt(TexturedDome(obeys=False)).moves
+    assert not characterized(TexturedDome(obeys=False)).moves
 
 
 def test_the_focal_length_is_seen():

@@ -1,4 +1,4 @@
-"""Learn what a dome does by looking at its own picture while it moves.
+"""Characterize a dome: measure what it does by looking at its own picture while it moves.
 
 A dome says little of itself, and not all of it is true. Its picture does not lie: scenes are far, so that pictures at
 several pans and tilts are related by rotations alone.
@@ -75,8 +75,8 @@ TURNED_DEG = 1.0  # by which the picture moves at a zoom whose device turns
 
 
 @dataclass(frozen=True)
-class Learnt:
-    """What was learnt.
+class Characteristics:
+    """What a dome was measured to do.
 
     Attributes:
         moves: whether it goes where it is sent; nothing else is known where it does not.
@@ -147,8 +147,8 @@ def room_of(rig: Rig) -> Room:
     return Room((middle[0], middle[1]), (reach[0], reach[1]))
 
 
-def learn(rig: Rig, room: Room, say: Say) -> Learnt:
-    """Turn and zoom a dome, and learn from its picture what it does.
+def characterize(rig: Rig, room: Room, say: Say) -> Characteristics:
+    """Turn and zoom a dome, and measure in its picture what it does.
 
     Args:
         rig: the rig; its lens goes through its whole range, and back to the shortest focal length.
@@ -165,7 +165,7 @@ def learn(rig: Rig, room: Room, say: Say) -> Learnt:
     say("looking around")
     views = _look_around(rig, room)
     if not views:
-        return Learnt(moves=False)
+        return Characteristics(moves=False)
     focal_px, rotations, used = fit_pictures([view.image for view in views], rig.zoom.focal_range[0], rig.zoom.size)
     seen = [views[i] for i in used]
     scale, off = fit_axes(rotations, [(view.state.pan, view.state.tilt) for view in [views[0], *seen]])
@@ -180,7 +180,7 @@ def learn(rig: Rig, room: Room, say: Say) -> Learnt:
     both_axes = not _go(rig, (room.middle[0] + math.radians(RAMP_DEG), room.middle[1]))[1]
     say("zooming")
     turns, growths, speeds = _zoom_through(rig, room, focal_px, say, reports=report_s is not None)
-    return Learnt(
+    return Characteristics(
         moves=True,
         orientation=orientation,
         scale=(signs[0] * scale[0], signs[1] * scale[1]),
@@ -568,7 +568,7 @@ def start_of_turns(turns: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
 
 
 def _time_starts(rig: Rig, room: Room, focal_px: float) -> tuple[float, float | None, float]:
-    """Turn to and fro; return `Learnt.light_s` and `report_s`, and the speed [rad/s]."""
+    """Turn to and fro; return `Characteristics.light_s` and `report_s`, and the speed [rad/s]."""
     turns, states = list[_Turn](), list[PanTiltState]()
     _go(rig, _beside(room, -RAMP_DEG / 2))
     for phase_s, side in zip(PHASES_S, itertools.cycle((1, -1)), strict=False):
@@ -593,7 +593,7 @@ def _report_s(turns: Sequence[_Turn], states: Sequence[PanTiltState], late: floa
 
 
 def _time_stops(rig: Rig, room: Room, focal_px: float, rate: float, scale: float) -> float | None:
-    """Halt slow turns; return `Learnt.stop_s`, None where they were over before.
+    """Halt slow turns; return `Characteristics.stop_s`, None where they were over before.
 
     Args:
         rig: the rig.
@@ -653,7 +653,7 @@ def growth_of(before: Image, after: Image) -> tuple[float, float] | None:
 
 
 def _zoom_through(rig: Rig, room: Room, focal_px: float, say: Say, *, reports: bool) -> tuple[bool, Pairs, Pairs]:
-    """Zoom from end to end; return `Learnt.turns_at_zoom`, `growths` and `speeds`, of the head's reports."""
+    """Zoom from end to end; return `Characteristics.turns_at_zoom`, `growths` and `speeds`, of the head's reports."""
     shortest, longest = rig.zoom.focal_range
     steps = np.geomspace(shortest, longest, ZOOM_STEPS + 1)[1:].tolist()
     before, _ = _go(rig, _goal(room, PLACES[3]))
