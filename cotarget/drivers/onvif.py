@@ -1,4 +1,4 @@
-"""A pan-tilt-zoom camera that ONVIF moves: Profile S, or T with the media service of S.
+"""A pan-tilt-zoom camera that ONVIF moves: Profile S or T.
 
 `OnvifDome` is the camera of a rig, and `OnvifLink` its protocol as `PolledHead` asks for it. The device says its media
 profiles, its coordinates with their ranges, and how it can be moved. It does not say how many degrees its coordinates
@@ -7,7 +7,7 @@ are: `pan_deg` and `tilt_deg` of rig.toml are what their ends mean.
 Positions are asked for on a thread of its own, because a status may block while the device moves; every command has a
 connection of its own, so that a stop waits for nothing.
 
-Sources: ONVIF PTZ Service Specification 23.12, Media Service Specification, Core Specification.
+Sources: ONVIF PTZ Service Specification 23.12, Media and Media2 Service Specifications, Core Specification.
 """
 
 import contextlib
@@ -43,14 +43,18 @@ from cotarget.drivers.soap import (
     text_at,
 )
 from cotarget.drivers.stream import EXAMPLE, stream_address
-from cotarget.drivers.velocity import ReckonedAxis, SteeredAxis
+from cotarget.drivers.velocity import ReckonedAxis, SteeredAxis, SteppedAxis
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.plugins import place_of
 from cotarget.rig import Clock
 from cotarget.schema import NotNegative, Positive, model
 
-MEDIA, PTZ = "http://www.onvif.org/ver10/media/wsdl", "http://www.onvif.org/ver20/ptz/wsdl"
+MEDIA, MEDIA2 = "http://www.onvif.org/ver10/media/wsdl", "http://www.onvif.org/ver20/media/wsdl"
+PTZ = "http://www.onvif.org/ver20/ptz/wsdl"
 SPACES = "http://www.onvif.org/ver10/tptz"
+STEPS_DEG, STEPS = (
+    f"{SPACES}/PanTiltSpaces/{name}" for name in ("SphericalTranslationSpaceDegrees", "TranslationGenericSpace")
+)
 # Ports at which cameras have ONVIF, the usual one first.
 PORTS = (80, 8000, 8080, 8899, 2020)
 ASK_S = 5.0  # for an answer while the device is opened [s]
@@ -111,6 +115,13 @@ class Range(NamedTuple):
 
 
 NOTHING = Range(0.0, 0.0)
+
+
+class Media(NamedTuple):
+    """A media service: its path, and the namespace of its messages, `MEDIA` or `MEDIA2`."""
+
+    path: str
+    namespace: str
 
 
 class Space(NamedTuple):
@@ -336,34 +347,55 @@ class OnvifDevice:
         ports = ", ".join(map(str, tried))
         raise DeviceError(f"{said}; ports {ports} were tried, and hardware.ptz.port is for another one")
 
-    def _services(self) -> tuple[str, str]:
-        """Return the paths of the media and the PTZ service."""
-        try:
-            root = self._ask(DEVICE_PATH, DEVICE, "GetCapabilities", "<Category>All</Category>")
-            found = find(root, "Body/GetCapabilitiesResponse/Capabilities")
-            media, ptz = text_at(found, "Media/XAddr"), text_at(found, "PTZ/XAddr")
-        except LoginFaultError:
-            raise
-        except FaultError:  # newer devices have GetServices alone
-            root = self._ask(DEVICE_PATH, DEVICE, "GetServices", "<IncludeCapability>false</IncludeCapability>")
-            known = find_all(root, "Body/GetServicesResponse/Service")
-            where = {text_at(each, "Namespace"): text_at(each, "XAddr") for each in known}
-            media, ptz = where.get(MEDIA, ""), where.get(PTZ, "")
+    def _services(self) -> tuple[Media, str]:
+        """Return the media service, and the path of the PTZ service."""
+        where = self._capabilities()
+        if not {MEDIA, PTZ} <= where.keys():  # newer devices have GetServices alone, and list there what is new
+            where |= self._listed_services()
+        ptz = where.get(PTZ, "")
         if not ptz:
             raise DeviceError(
                 f"{self.name} ({self.model}) has no pan-tilt-zoom service: it can be [hardware.fixed] with "
                 'driver = "stream"'
             )
+        namespace = MEDIA2 if MEDIA2 in where and MEDIA not in where else MEDIA
         # Behind a router or a proxy a device gives an address that leads nowhere from here.
-        return urlsplit(media).path or DEVICE_PATH, urlsplit(ptz).path or DEVICE_PATH
+        media, ptz = (urlsplit(address).path or DEVICE_PATH for address in (where.get(namespace, ""), ptz))
+        return Media(media, namespace), ptz
 
-    def _find_profile(self, media: str) -> tuple[str, Element]:
+    def _capabilities(self) -> dict[str, str]:
+        """Return the addresses of services by GetCapabilities, which some devices lack."""
+        try:
+            root = self._ask(DEVICE_PATH, DEVICE, "GetCapabilities", "<Category>All</Category>")
+        except LoginFaultError:
+            raise
+        except FaultError:
+            return {}
+        found = find(root, "Body/GetCapabilitiesResponse/Capabilities")
+        said = {MEDIA: text_at(found, "Media/XAddr"), PTZ: text_at(found, "PTZ/XAddr")}
+        return {namespace: address for namespace, address in said.items() if address}
+
+    def _listed_services(self) -> dict[str, str]:
+        """Return the addresses of services by GetServices, which older devices lack."""
+        try:
+            root = self._ask(DEVICE_PATH, DEVICE, "GetServices", "<IncludeCapability>false</IncludeCapability>")
+        except LoginFaultError:
+            raise
+        except FaultError:
+            return {}
+        known = find_all(root, "Body/GetServicesResponse/Service")
+        return {text_at(each, "Namespace"): text_at(each, "XAddr") for each in known}
+
+    def _find_profile(self, media: Media) -> tuple[str, Element]:
         """Return the token of the media profile, and its PTZ configuration."""
-        profiles = find_all(self._ask(media, MEDIA, "GetProfiles"), "Body/GetProfilesResponse/Profiles")
+        inner, path = (
+            ("", "PTZConfiguration") if media.namespace == MEDIA else ("<Type>PTZ</Type>", "Configurations/PTZ")
+        )
+        profiles = find_all(self._ask(*media, "GetProfiles", inner), "Body/GetProfilesResponse/Profiles")
         moving = {
             profile.get("token", ""): configuration
             for profile in profiles
-            if (configuration := find(profile, "PTZConfiguration")) is not None
+            if (configuration := find(profile, path)) is not None
         }
         names = [quote(profile.get("token", "")) for profile in profiles]
         if not moving:
@@ -390,15 +422,17 @@ class OnvifDevice:
         node = next((node for node in nodes if node.get("token") == wanted), None)
         return spaces_of(find(node, "SupportedPTZSpaces"))
 
-    def _stream_address(self, media: str) -> str:
+    def _stream_address(self, media: Media) -> str:
         """Return the address of the stream, at the host that the user has given; empty where the device says none."""
         setup = "<t:Stream>RTP-Unicast</t:Stream><t:Transport><t:Protocol>RTSP</t:Protocol></t:Transport>"
-        inner = f"<StreamSetup>{setup}</StreamSetup>{self._token}"
+        inner, path = f"<StreamSetup>{setup}</StreamSetup>", "MediaUri/Uri"
+        if media.namespace == MEDIA2:
+            inner, path = "<Protocol>RTSP</Protocol>", "Uri"
         try:
-            root = self._ask(media, MEDIA, "GetStreamUri", inner)
+            root = self._ask(*media, "GetStreamUri", inner + self._token)
         except FaultError:
             return ""
-        said = text_at(root, "Body/GetStreamUriResponse/MediaUri/Uri")
+        said = text_at(root, f"Body/GetStreamUriResponse/{path}")
         host = f"[{self._settings.host}]" if ":" in self._settings.host else self._settings.host
         try:
             parts = urlsplit(said)
@@ -493,8 +527,9 @@ class Workers:
 class OnvifLink(PtzLink):
     """The protocol of a camera that ONVIF moves; the camera was only asked.
 
-    Pan and tilt go to positions by absolute moves, or are steered there by velocities where the device has no absolute
-    moves. Positions that the device does not say are reckoned from the commands.
+    Pan and tilt go to positions by absolute moves. Where the device has none, they are steered there by velocities, and
+    where it has no velocities either, they go by relative moves, here steps. Positions that the device does not say are
+    reckoned from the commands.
 
     Raises:
         ConfigError: it has no such profile.
@@ -511,11 +546,12 @@ class OnvifLink(PtzLink):
         with contextlib.ExitStack() as opened:
             opened.callback(device.soap.close)
             status = device.status()
-            self._is_steered = self._refuse_unable(status)
+            self._way = self._refuse_unable(status)
             self._coordinates = self._find_coordinates(status)
             self.axes = self._find_axes()
             self._reckoned = [ReckonedAxis(facts, settings.command_delay_s) for facts in self.axes]
             self._steered = [SteeredAxis(facts, settings.command_delay_s) for facts in self.axes[:2]]
+            self._stepped, self._speeds = (SteppedAxis(), SteppedAxis()), (0.0, 0.0)
             self._renewed, self._timeout_s = -math.inf, self._find_timeout()
             self._seen, self._heard = status, clock.now()
             self._said = dict[int, float]()  # when the device said the position of each axis last
@@ -538,34 +574,36 @@ class OnvifLink(PtzLink):
         elif now - self._heard < BLIND_S:
             return []
         polls = self._polls(status or Status(None, None, None, now), now)
-        if self._is_steered:
-            try:
+        try:
+            if self._way == "velocities":
                 self._steer(requests, is_blind=status is None)
-            except RefusedError as error:  # such as "busy": it ends the move
-                self._stop(now + STOP_S)
-                raise CutError(str(error)) from None
+            elif self._way == "steps" and status is not None and status.t > self._due + STILL_S:
+                self._step_on(requests)
+        except RefusedError as error:  # such as "busy": it ends the move
+            self._stop(now + STOP_S)
+            raise CutError(str(error)) from None
         return polls
 
     def move(self, goals: Pair, speeds: Pair, requests: Requests) -> None:
         """Send pan and tilt to positions by an absolute move, or begin to steer them there."""
         self._goals, now = (*goals, self._goals[2]), self._clock.now()
-        if self._is_steered:
+        if self._way == "velocities":
             for axis, goal, speed in zip(self._steered, goals, speeds, strict=True):
                 axis.aim(goal, speed, now)
             self._steer(requests)
             return
-        zoom = self._goal_or_place(2, now) if self._settings.all_axes else None
-        fastest = self._fastest_deg_s
-        pan, tilt = (min(speed / fastest, 1.0) for speed in speeds)
-        self._absolute(goals, zoom, (pan, tilt), requests)
-        for reckoned, goal, speed in zip(self._reckoned[:2], goals, speeds, strict=True):
-            reckoned.command(goal, speed, now)
-        self._due = max(reckoned.arrives for reckoned in self._reckoned)
+        self._speeds = speeds
+        if self._way == "steps":
+            self._step(goals, requests)
+        else:
+            zoom = self._goal_or_place(2, now) if self._settings.all_axes else None
+            self._absolute(goals, zoom, self._shares(), requests)
+        self._reckon(goals, now)
 
     def zoom(self, position: float, requests: Requests) -> None:
         """Send the lens to a position."""
         self._goals, now = (*self._goals[:2], position), self._clock.now()
-        all_axes = self._settings.all_axes and not self._is_steered
+        all_axes = self._settings.all_axes and self._way == "positions"
         both = (self._goal_or_place(0, now), self._goal_or_place(1, now)) if all_axes else None
         self._absolute(both, position, None, requests)
         self._reckoned[2].command(position, self.axes[2].fastest, now)
@@ -589,19 +627,25 @@ class OnvifLink(PtzLink):
 
     # What the device is
 
-    def _refuse_unable(self, status: Status) -> bool:
-        """Refuse a device that can be neither sent nor steered to positions; return whether it has to be steered."""
+    def _refuse_unable(self, status: Status) -> str:
+        """Refuse a device that can be neither sent nor led to positions; return by what it is moved."""
         abilities, who = self._device.abilities, self._who
         if not abilities.space("AbsoluteZoomPositionSpace") and abilities.spaces:
             raise DeviceError(f"{who} has no zoom that goes to positions: it is not driven")
         if abilities.space("AbsolutePanTiltPositionSpace") and self._settings.absolute:
-            return False
-        if not abilities.space("ContinuousPanTiltVelocitySpace"):
-            by = "steps" if abilities.space("RelativePanTiltTranslationSpace") else "presets"
+            return "positions"
+        by = "velocities" if abilities.space("ContinuousPanTiltVelocitySpace") else "steps"
+        if by == "steps" and self._steps_space() is None:
+            by = "steps in parts of its picture" if abilities.space("RelativePanTiltTranslationSpace") else "presets"
             raise DeviceError(f"{who} has neither absolute moves nor velocities, only {by}: it is not driven")
         if status.pan is None or status.tilt is None:
-            raise DeviceError(f"{who} can only be moved by velocities, and does not say where it is: it is not driven")
-        return True
+            raise DeviceError(f"{who} can only be moved by {by}, and does not say where it is: it is not driven")
+        return by
+
+    def _steps_space(self) -> Space | None:
+        """Return the space of relative moves, in degrees if there is such a one; None without a known one."""
+        known = {space.uri: space for space in self._device.abilities.spaces.get("RelativePanTiltTranslationSpace", ())}
+        return known.get(STEPS_DEG) or known.get(STEPS)
 
     def _find_timeout(self) -> float | None:
         """Return the timeout of continuous moves [s]; None where the device has none of its own choice."""
@@ -674,7 +718,7 @@ class OnvifLink(PtzLink):
             where.append(f"no position of {' and '.join(missing)}, which is reckoned from the commands")
         off = self._device.soap.clock_off_s
         clock = [f"its clock {off:+.0f} s off"] if abs(off) > 1.0 else []
-        way = ["steered by velocities"] if self._is_steered else []
+        way = {"velocities": ["steered by velocities"], "steps": ["moved by relative moves"]}.get(self._way, [])
         address = self.name.removeprefix("the device at ")
         parts = [f"{self._device.model} at {address}", f"profile {quote(self._device.profile)}", *clock, *way, *where]
         return ", ".join(parts)
@@ -790,13 +834,54 @@ class OnvifLink(PtzLink):
         if len(faults) == count:
             why = f"; {RIGHTS}" if isinstance(faults[0], LoginFaultError) else ""
             raise DeviceError(f"{self.name} does not stop: {faults[0]}{why}") from faults[0]
-        if self._is_steered:
+        if self._way == "velocities":
             self.guard([])
         self._due = now = self._clock.now()
         for steered in self._steered:
             steered.stop(now)
         for reckoned in self._reckoned[:2]:
             reckoned.halt(now)
+
+    def _shares(self) -> Pair:
+        """Return the speeds of the newest move as shares of the highest."""
+        pan, tilt = (min(speed / self._fastest_deg_s, 1.0) for speed in self._speeds)
+        return pan, tilt
+
+    def _reckon(self, goals: Pair, now: float) -> None:
+        """Reckon where a move of now leads."""
+        for reckoned, goal, speed in zip(self._reckoned[:2], goals, self._speeds, strict=True):
+            reckoned.command(goal, speed, now)
+        self._due = max(reckoned.arrives for reckoned in self._reckoned)
+
+    def _step(self, goals: Pair, requests: Requests) -> None:
+        """Send pan and tilt to positions by a relative move from where they are."""
+        now, space = self._clock.now(), self._steps_space()
+        assert space is not None
+        steps = []
+        for i, (stepped, reckoned) in enumerate(zip(self._stepped, self._reckoned, strict=False)):
+            way = stepped.toward(goals[i], reckoned.at(now)[0], rests=now > self._due + STILL_S)
+            if space.uri == STEPS:  # the largest number is from one end to the other
+                degrees, numbers = self._coordinates[i].degrees, space.ranges[i]
+                way *= numbers.highest / (degrees.highest - degrees.lowest)
+                way = min(max(way, numbers.lowest), numbers.highest)
+            steps.append(way)
+        inner = f"<Translation>{vector(steps[0], steps[1], None, (space.uri, ''))}</Translation>"
+        inner += f"<Speed>{speeds_in(self._device.abilities.space('PanTiltSpeedSpace'), *self._shares())}</Speed>"
+        self._send("RelativeMove", inner, requests)
+
+    def _step_on(self, requests: Requests) -> None:
+        """Send pan and tilt on where a step has ended off the goal."""
+        pan, tilt, _ = self._positions(self._seen)
+        goals = self._goals[:2]
+        assert pan is not None
+        assert tilt is not None
+        for stepped, at in zip(self._stepped, (pan, tilt), strict=True):
+            stepped.rest(at)
+        if goals[0] is None or goals[1] is None:
+            return
+        if max(abs(goals[0] - pan), abs(goals[1] - tilt)) > self._settings.slack_deg:
+            self._step((goals[0], goals[1]), requests)
+            self._reckon((goals[0], goals[1]), self._clock.now())
 
     def _absolute(self, goals: Pair | None, zoom: float | None, speeds: Pair | None, requests: Requests) -> None:
         pan, tilt = (None, None) if goals is None else map(Coordinate.to_number, self._coordinates[:2], goals)

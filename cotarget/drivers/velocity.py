@@ -1,4 +1,4 @@
-"""Axes that do not say where they are, or do not go where they are sent: dead reckoning, and steering by velocity.
+"""Axes that do not say where they are, or do not go where they are sent: dead reckoning, steering by velocity, steps.
 
 Positions and speeds are in the numbers of the axis's facts. Times are on the rig's clock [s].
 """
@@ -14,6 +14,8 @@ SLOWEST = 1e-6  # a speed of zero would never arrive
 GAIN_HZ = 4.0  # of steering; above a third of the inverse of the unpredicted dead time it would overshoot
 FLOW_S = 0.5  # goals that follow each other as soon move along
 FLOW_GAIN = 0.4  # by which the newest pair of goals changes their estimated speed
+MEASURED_DEG = 1.0  # shortest step from which it is measured how far the device goes
+GAINS = (0.1, 10.0)  # of a device's steps that are believed
 
 
 class ReckonedAxis:
@@ -124,3 +126,34 @@ class SteeredAxis:
         for (begin, velocity), end in zip(self._sent, ends, strict=True):
             position += velocity * max(end - max(begin, t - self._delay), 0.0)
         return position
+
+
+class SteppedAxis:
+    """Steps that lead an axis to its goal.
+
+    What a step of 1 in the generic space is differs from device to device. How far the axis went for a step from rest
+    is measured when it rests again.
+    """
+
+    def __init__(self) -> None:
+        self._gain = 1.0  # of the device: way over step
+        self._from: float | None = None  # where the newest step began, if it began at rest
+        self._step = 0.0
+
+    def toward(self, goal: float, position: float, *, rests: bool) -> float:
+        """Return the step from a position to a goal.
+
+        Args:
+            goal: position to go to.
+            position: where the axis is when the step begins.
+            rests: whether it rests there.
+        """
+        self._step = (goal - position) / self._gain
+        self._from = position if rests else None
+        return self._step
+
+    def rest(self, position: float) -> None:
+        """Take the position where the axis rests after a step."""
+        if self._from is not None and abs(self._step) > MEASURED_DEG:
+            self._gain = min(max((position - self._from) / self._step, GAINS[0]), GAINS[1])
+        self._from = None

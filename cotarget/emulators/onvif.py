@@ -34,6 +34,8 @@ ONVIF_PROFILES = (
     "absolute-ignored",  # an absolute move is answered, and nothing moves
     "no-absolute",  # pan and tilt have no absolute moves
     "continuous-only",  # pan and tilt have velocities alone
+    "relative-only",  # pan and tilt have relative moves alone
+    "relative-degrees",  # relative moves have a space in degrees, too
     "presets-only",
     "slow-stop",  # after a stop it turns on for 0.4 s
     "slower-stop",  # for 1.1 s
@@ -46,6 +48,7 @@ ONVIF_PROFILES = (
     "missing-is-zero",  # an axis that a move does not name goes to 0
     "pan-alone-ignored",  # a move of one axis alone does nothing
     "signs-only",  # a velocity has the highest speed
+    "lowest-speed",  # a velocity turns it by 1.5 degrees/s at least
     "rounded",  # positions are multiples of 0.01 of -1 to 1
     # Status
     "no-status",  # without positions
@@ -67,6 +70,7 @@ ONVIF_PROFILES = (
     "http-digest",  # it knows no tokens
     "needs-administrator",  # the user may look but not move
     "behind-nat",  # its answers have an address that leads nowhere
+    "media2-only",  # it has the media service of Profile T alone
 )
 ONVIF_FAULTS = (
     "silence",  # it takes requests and answers none
@@ -82,12 +86,14 @@ ONVIF_FAULTS = (
 )
 ENVELOPE = "http://www.w3.org/2003/05/soap-envelope"
 TDS, TRT = "http://www.onvif.org/ver10/device/wsdl", "http://www.onvif.org/ver10/media/wsdl"
+TR2 = "http://www.onvif.org/ver20/media/wsdl"
 TPTZ, TT = "http://www.onvif.org/ver20/ptz/wsdl", "http://www.onvif.org/ver10/schema"
 TER = "http://www.onvif.org/ver10/error"
 PAN_TILT, ZOOM = "http://www.onvif.org/ver10/tptz/PanTiltSpaces", "http://www.onvif.org/ver10/tptz/ZoomSpaces"
+RELATIVE_DEGREES = f"{PAN_TILT}/SphericalTranslationSpaceDegrees"
 DIGEST = "PasswordDigest"
-NAMESPACES = {"tds": TDS, "trt": TRT, "tptz": TPTZ}
-SERVICES = {"device": TDS, "media": TRT, "ptz": TPTZ}
+NAMESPACES = {"tds": TDS, "trt": TRT, "tr2": TR2, "tptz": TPTZ}
+SERVICES = {"device": TDS, "media": TRT, "media2": TR2, "ptz": TPTZ}
 TOKEN, CONFIGURATION, NODE = "profile_1", "ptz_1", "node_1"
 
 
@@ -112,6 +118,7 @@ STALE_S = 0.5
 BLOCKS_S = 30.0  # longest time that a status blocks [s]
 LONGEST_TIMEOUT_S = {True: 10.0, False: 600.0}  # by whether it is clamped
 DEFAULT_TIMEOUT_S = 5.0
+LOWEST_DEG_S = 1.5
 # Highest speed by the share of the zoom's range in its logarithm, of domes that limit it [degrees/s].
 CAPS = ((0.2, math.inf), (0.4, 30.0), (0.6, 7.85), (0.8, 4.5), (1.0, 1.5))
 # Numbers and magnifications of a zoom block of 25 x, as shares of the range.
@@ -308,10 +315,10 @@ class OnvifCamera:
                 low, high = (self.model.pan_deg, self.model.tilt_deg)[i]
                 backward = ("pan-reversed", "tilt-reversed")[i] in self._faults
                 end = high if (share > 0) != backward else low
-                share = 1.0 if "signs-only" in self._faults else min(abs(share), 1.0)
-                axis.command(
-                    round(end / self.model.step_deg), share * fastest / self.model.step_deg, self._acceleration
-                )
+                speed = fastest if "signs-only" in self._faults else min(abs(share), 1.0) * fastest
+                if "lowest-speed" in self._faults:
+                    speed = max(speed, LOWEST_DEG_S)
+                axis.command(round(end / self.model.step_deg), speed / self.model.step_deg, self._acceleration)
             if "timeout-ignored" not in self._faults:
                 longest = LONGEST_TIMEOUT_S["timeout-clamped" in self._faults]
                 self._end.after(min(timeout_s or DEFAULT_TIMEOUT_S, longest), self.halt)
@@ -434,23 +441,26 @@ def _address(message: Message, faults: Faults, service: str) -> str:
 
 @answers("tds", "GetCapabilities")
 def _capabilities(camera: OnvifCamera, faults: Faults, message: Message) -> str:
-    device, media, ptz = (f"<tt:XAddr>{_address(message, faults, name)}</tt:XAddr>" for name in SERVICES)
-    moves = "" if "no-ptz" in faults else f"<tt:PTZ>{ptz}</tt:PTZ>"
-    return (
-        f"<tds:Capabilities><tt:Device>{device}</tt:Device><tt:Media>{media}<tt:StreamingCapabilities>"
-        "<tt:RTP_RTSP_TCP>true</tt:RTP_RTSP_TCP></tt:StreamingCapabilities></tt:Media>"
-        f"{moves}</tds:Capabilities>"
-    )
+    where = {name: f"<tt:XAddr>{_address(message, faults, name)}</tt:XAddr>" for name in _services_of(faults)}
+    shows = "<tt:StreamingCapabilities><tt:RTP_RTSP_TCP>true</tt:RTP_RTSP_TCP></tt:StreamingCapabilities>"
+    media = f"<tt:Media>{where['media']}{shows}</tt:Media>" if "media" in where else ""
+    moves = f"<tt:PTZ>{where['ptz']}</tt:PTZ>" if "ptz" in where else ""
+    return f"<tds:Capabilities><tt:Device>{where['device']}</tt:Device>{media}{moves}</tds:Capabilities>"
+
+
+def _services_of(faults: Faults) -> list[str]:
+    """List the services that it has."""
+    lacks = {"media" if "media2-only" in faults else "media2", *(["ptz"] if "no-ptz" in faults else [])}
+    return [name for name in SERVICES if name not in lacks]
 
 
 @answers("tds", "GetServices")
 def _services(camera: OnvifCamera, faults: Faults, message: Message) -> str:
     return "".join(
-        f"<tds:Service><tds:Namespace>{namespace}</tds:Namespace>"
+        f"<tds:Service><tds:Namespace>{SERVICES[name]}</tds:Namespace>"
         f"<tds:XAddr>{_address(message, faults, name)}</tds:XAddr>"
         "<tds:Version><tt:Major>2</tt:Major><tt:Minor>60</tt:Minor></tds:Version></tds:Service>"
-        for name, namespace in SERVICES.items()
-        if not (name == "ptz" and "no-ptz" in faults)
+        for name in _services_of(faults)
     )
 
 
@@ -470,15 +480,20 @@ def _spaces(camera: OnvifCamera, faults: Faults) -> str:
     absolute = _space("AbsolutePanTiltPositionSpace", camera.space, *camera.numbers())
     zoom = _space("AbsoluteZoomPositionSpace", f"{ZOOM}/PositionGenericSpace", camera.zoom_numbers())
     relative = _space("RelativePanTiltTranslationSpace", f"{PAN_TILT}/TranslationGenericSpace", unit, unit)
-    if "no-absolute" in faults or "continuous-only" in faults:
+    velocity = _space("ContinuousPanTiltVelocitySpace", f"{PAN_TILT}/VelocityGenericSpace", unit, unit)
+    if "relative-degrees" in faults:
+        relative += _space("RelativePanTiltTranslationSpace", RELATIVE_DEGREES, (-360.0, 360.0), (-180.0, 180.0))
+    if any(name in faults for name in ("no-absolute", "continuous-only", "relative-only")):
         absolute = ""
     if "continuous-only" in faults:
         relative = ""
+    if "relative-only" in faults:
+        velocity = ""
     return (
         absolute
         + zoom
         + relative
-        + _space("ContinuousPanTiltVelocitySpace", f"{PAN_TILT}/VelocityGenericSpace", unit, unit)
+        + velocity
         + _space("ContinuousZoomVelocitySpace", f"{ZOOM}/VelocityGenericSpace", unit)
         + _space("PanTiltSpeedSpace", f"{PAN_TILT}/GenericSpeedSpace", share)
         + _space("ZoomSpeedSpace", f"{ZOOM}/ZoomGenericSpeedSpace", share)
@@ -518,13 +533,35 @@ def _profiles(camera: OnvifCamera, faults: Faults, message: Message) -> str:
 @answers("trt", "GetStreamUri")
 def _stream(camera: OnvifCamera, faults: Faults, message: Message) -> str:
     _refuse_other_profile(message)
-    address = camera.model.stream
-    if "behind-nat" in faults:
-        address = re.sub(r"//[^/:]+", "//10.255.255.1", address)
     return (
-        f"<trt:MediaUri><tt:Uri>{address}</tt:Uri><tt:InvalidAfterConnect>false</tt:InvalidAfterConnect>"
-        "<tt:InvalidAfterReboot>false</tt:InvalidAfterReboot><tt:Timeout>PT0S</tt:Timeout></trt:MediaUri>"
+        f"<trt:MediaUri><tt:Uri>{_stream_address(camera, faults)}</tt:Uri>"
+        "<tt:InvalidAfterConnect>false</tt:InvalidAfterConnect><tt:InvalidAfterReboot>false</tt:InvalidAfterReboot>"
+        "<tt:Timeout>PT0S</tt:Timeout></trt:MediaUri>"
     )
+
+
+def _stream_address(camera: OnvifCamera, faults: Faults) -> str:
+    return re.sub(r"//[^/:]+", "//10.255.255.1", camera.model.stream) if "behind-nat" in faults else camera.model.stream
+
+
+@answers("tr2", "GetProfiles")
+def _profiles_2(camera: OnvifCamera, faults: Faults, message: Message) -> str:
+    """List the profile; it has the configurations of the types that were asked for."""
+    asked = {(each.text or "").strip() for each in message.body.findall("{*}Type")}
+    moves = {"PTZ", "All"} & asked and "no-ptz" not in faults
+    configuration = _configuration(camera, faults, "tr2:PTZ") if moves else ""
+    return (
+        f'<tr2:Profiles token="{TOKEN}" fixed="true"><tr2:Name>main</tr2:Name>'
+        f"<tr2:Configurations>{configuration}</tr2:Configurations></tr2:Profiles>"
+    )
+
+
+@answers("tr2", "GetStreamUri")
+def _stream_2(camera: OnvifCamera, faults: Faults, message: Message) -> str:
+    _refuse_other_profile(message)
+    if message.text("Protocol") not in ("RtspUnicast", "RtspMulticast", "RTSP", "RtspOverHttp"):
+        raise SoapFault("no such protocol", "InvalidArgVal", "InvalidStreamSetup")
+    return f"<tr2:Uri>{_stream_address(camera, faults)}</tr2:Uri>"
 
 
 @answers("tptz", "GetConfigurations")
@@ -589,7 +626,8 @@ def _refuse_unable(message: Message, faults: Faults, *without: str) -> None:
 @answers("tptz", "AbsoluteMove")
 def _absolute(camera: OnvifCamera, faults: Faults, message: Message) -> str:
     pan, tilt, zoom = message.vector("Position")
-    _refuse_unable(message, faults, "presets-only", *("no-absolute", "continuous-only") * (pan is not None))
+    without = ("no-absolute", "continuous-only", "relative-only") if pan is not None else ()
+    _refuse_unable(message, faults, "presets-only", *without)
     speed = message.vector("Speed")[:2]
     if "absolute-ignored" not in faults:
         speeds = None if speed[0] is None or speed[1] is None else (speed[0], speed[1])
@@ -602,17 +640,23 @@ def _relative(camera: OnvifCamera, faults: Faults, message: Message) -> str:
     _refuse_unable(message, faults, "continuous-only", "presets-only")
     pan, tilt, zoom = message.vector("Translation")
     at, numbers = camera.position(), camera.numbers()
-    goals = [
-        None if way is None else min(max(here + way * (high - low) / 2, low), high)
-        for way, here, (low, high) in zip((pan, tilt), at[:2], numbers, strict=True)
-    ]
+    turned = message.body.find("{*}Translation/{*}PanTilt")
+    in_degrees = turned is not None and turned.get("space") == RELATIVE_DEGREES
+    if in_degrees and "relative-degrees" not in faults:
+        raise SoapFault("no such space", "InvalidArgVal", "SpaceNotSupported")
+    goals = []
+    for way, here, (low, high), ends in zip(
+        (pan, tilt), at[:2], numbers, (camera.model.pan_deg, camera.model.tilt_deg), strict=True
+    ):
+        width = ends[1] - ends[0] if in_degrees else 2.0
+        goals.append(None if way is None else min(max(here + way * (high - low) / width, low), high))
     camera.go(goals, None if zoom is None else min(max(at[2] + zoom, 0.0), 1.0), None)
     return ""
 
 
 @answers("tptz", "ContinuousMove")
 def _continuous(camera: OnvifCamera, faults: Faults, message: Message) -> str:
-    _refuse_unable(message, faults, "presets-only")
+    _refuse_unable(message, faults, "presets-only", *["relative-only"] * (message.vector("Velocity")[0] is not None))
     said = message.text("Timeout")
     if said and "timeout-fault" in faults:
         raise SoapFault("Timeout is not supported", "InvalidArgVal", "TimeoutNotSupported")
@@ -791,7 +835,7 @@ class OnvifServer(TcpServer):
             self.counts.messages.append(message.name)
             self._refuse_user(message, root)
             answer = ANSWERS.get((message.service, message.name))
-            if answer is None or (message.service == TPTZ and "no-ptz" in self.faults):
+            if answer is None or message.service not in {SERVICES[name] for name in _services_of(self.faults)}:
                 raise SoapFault("Optional action not implemented", "ActionNotSupported", code="Receiver")
             said = answer(self.camera, self.faults, message)
         except SoapFault as fault:

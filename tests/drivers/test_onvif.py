@@ -84,13 +84,31 @@ def test_signs_of_rig_toml_turn_an_axis_that_counts_the_other_way(profile):
         assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((20.0, 15.0), abs=NEAR_DEG), limits
 
 
-@pytest.mark.parametrize("profile", ["wide-ranges", "degrees", "always-moving", "boolean-status", "behind-nat"])
+@pytest.mark.parametrize(
+    "profile", ["wide-ranges", "degrees", "always-moving", "boolean-status", "behind-nat", "media2-only"]
+)
 def test_other_ranges_spaces_states_and_addresses_are_understood(profile):
     with OnvifUnit(profile) as unit, opened(unit) as dome:
         dome.head.move(math.radians(-20.0), math.radians(10.0), wait=True)
         assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((-20.0, 10.0), abs=NEAR_DEG)
         assert not dome.head.state().moving
         assert dome.zoom.read(timeout=10.0).image.shape == (240, 320, 3)
+
+
+@pytest.mark.parametrize("profiles", [["relative-only"], ["relative-only", "relative-degrees", "pan-reversed"]])
+def test_relative_moves_lead_to_positions_whatever_a_step_of_1_is(profiles):
+    signs = {"pan_sign": -1} if "pan-reversed" in profiles else {}
+    with OnvifUnit(*profiles) as unit, opened(unit, **signs) as dome:
+        for goal in ((20.0, 10.0), (-40.0, -5.0), (-38.0, -5.0)):
+            dome.head.move(*map(math.radians, goal), wait=True)
+            assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx(goal, abs=unit.settings.slack_deg)
+        assert set(unit.moves) == {"RelativeMove"}
+        dome.head.move(math.radians(100.0), 0.0, speed=math.radians(20.0))
+        wait_for(lambda: unit.pan.degrees() > 0.0)
+        dome.head.halt()
+        wait_for(lambda: not dome.head.state().moving)
+        assert unit.pan.degrees() < 20.0
+        assert not unit.turning()
 
 
 def test_a_speed_is_a_share_of_the_highest():
