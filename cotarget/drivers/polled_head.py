@@ -84,6 +84,7 @@ TRIES = 3  # of a move, and of polls in a row, that end because the unit was sil
 PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
 # A unit that reports no position for this time [s] and in so many polls is dead; a program may have been suspended.
 UNHEARD_S, UNHEARD_POLLS = 5.0, 10
+STRANGE_RAD = math.radians(0.5)  # turned without a command, beyond the slack: another program moves the unit
 LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: a unit may answer only when it stands [s]
 
 
@@ -143,6 +144,7 @@ class Loop:
         self._has_moved = False  # whether a move was sent since the last zoom
         self._cuts = 0  # in a row, without a poll between them
         self._active: Move | None = None
+        self._rest: tuple[float, ...] | None = None  # where the head stands since the last command
         self._speeds: Pair = (0.0, 0.0)  # of the last move
         self.requests = Requests()
         self.halted = 0  # number of the newest halt that was taken out of the queue
@@ -272,7 +274,28 @@ class Loop:
         )
         self._zooming = position, self._clock.now() + longest + self._delay + PATIENCE_S
 
+    def _report_strange_motion(self) -> None:
+        """Warn, once a motion, of a head that leaves the place where it stood although nothing was commanded."""
+        if self._active is not None or any(track.newest.sigma for track in self._head):
+            return
+        if self._rest is None:
+            if self._stand(self._head):
+                self._rest = tuple(track.newest.position for track in self._head)
+            return
+        turned = max(
+            (abs(track.newest.position - rest) - 2 * track.facts.slack) * track.facts.unit
+            for track, rest in zip(self._head, self._rest, strict=True)
+        )
+        if turned > STRANGE_RAD:
+            self._rest = None
+            log.warning(
+                "%s: the head turns without a command: see that no other program, guard tour or idle preset moves it",
+                self._link.name,
+            )
+
     def _expect_motion(self, tracks: Sequence[AxisTrack]) -> None:
+        if tracks is self._head:
+            self._rest = None
         for track in tracks:
             track.expect_motion(self._clock.now() + self._delay)
 
@@ -291,6 +314,7 @@ class Loop:
                 self._refuse_late(move, min(track.newest.t for track in self._head))
             else:
                 self._renew(move)
+        self._report_strange_motion()
         self._check_lens()
         self.snapshot, self.lens_snapshot = self._see(self._head), self._see(self._lens)
 

@@ -29,6 +29,7 @@ LOST_S = 0.7  # longer than a stop waits for its answer
 AWAY_S = 0.25
 SILENT_S = 60.0
 HANGS_AT, HANGS_S = 10, 2.0  # the status of this number takes so long
+NOTICED_S = 1.0  # another client's move
 SETTLED_S = 0.5  # of a halt's answer and of braking from the highest speed
 
 
@@ -109,6 +110,22 @@ def test_relative_moves_lead_to_positions_whatever_a_step_of_1_is(profiles):
         wait_for(lambda: not dome.head.state().moving)
         assert unit.pan.degrees() < 20.0
         assert not unit.turning()
+
+
+def test_a_head_that_another_program_moves_is_reported_once_and_left_alone(caplog):
+    with OnvifUnit() as unit, opened(unit) as dome:
+        dome.head.move(math.radians(10.0), 0.0, wait=True)
+        sent = list(unit.moves)
+        time.sleep(SETTLED_S)
+        unit.pan.command(round(40.0 / STEP_DEG), 20.0 / STEP_DEG, 1e6)
+        wait_for(lambda: "turns without a command" in caplog.text, NOTICED_S)
+        wait_for(lambda: unit.pan.degrees() == pytest.approx(40.0))
+        time.sleep(SETTLED_S)
+        dome.head.move(math.radians(-30.0), 0.0, wait=True)
+        dome.head.halt()
+        time.sleep(SETTLED_S)
+        assert caplog.text.count("turns without a command") == 1
+        assert unit.moves[: len(sent) + 1] == [*sent, "AbsoluteMove"]
 
 
 def test_a_speed_is_a_share_of_the_highest():
