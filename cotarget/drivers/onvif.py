@@ -21,7 +21,7 @@ from concurrent.futures import TimeoutError as NotDoneError
 from dataclasses import dataclass, replace
 from functools import partial
 from os import environ
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 from urllib.parse import urlsplit
 from xml.etree.ElementTree import Element
 
@@ -47,7 +47,7 @@ from cotarget.drivers.velocity import ReckonedAxis, SteeredAxis, SteppedAxis
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.plugins import place_of
 from cotarget.rig import Clock
-from cotarget.schema import NotNegative, Positive, model
+from cotarget.schema import Check, NotNegative, Positive, model
 
 MEDIA, MEDIA2 = "http://www.onvif.org/ver10/media/wsdl", "http://www.onvif.org/ver20/media/wsdl"
 PTZ = "http://www.onvif.org/ver20/ptz/wsdl"
@@ -94,7 +94,7 @@ class OnvifSettings(PtzSettings):
         all_axes: whether each move names pan, tilt and zoom; for a device that takes a missing one as 0.
     """
 
-    url: str = ""
+    url: Annotated[str, Check(stream_address)] = ""
     profile: str = ""
     slack_deg: NotNegative = 0.1
     status_delay_s: NotNegative = 0.0

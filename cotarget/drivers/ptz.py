@@ -49,6 +49,24 @@ Knots = tuple[tuple[float, float], ...]  # (zoom number, magnification)
 USUAL_KNOTS: Knots = ((0.0, 1.0), (1.0, 20.0))  # at the ends of a device's own range
 
 
+def _host(host: str) -> str:
+    """Check the address of a device.
+
+    Raises:
+        ValueError: there is more in it.
+    """
+    if "@" in host:
+        raise ValueError("has a user or a password in it; write user = and give the password in COTARGET_PASSWORD")
+    _, is_url, rest = host.rpartition("://")
+    name, _, port = rest.partition("/")[0].partition(":")
+    if is_url or (port.isdigit() and name):
+        also = f" and port = {port}" if port else ""
+        raise ValueError(f"'{host}' is more than an address; write host = \"{name}\"{also}")
+    if any(sign in host for sign in "/[] "):
+        raise ValueError(f"'{host}' is no address, such as 192.168.0.88")
+    return host
+
+
 def _knots(lens: Knots) -> Knots:
     if lens and (len(lens) < 2 or any(b[0] <= a[0] or b[1] <= a[1] for a, b in itertools.pairwise(lens))):
         raise ValueError("needs two or more [number, magnification], both of them increasing")
@@ -85,7 +103,7 @@ class PtzSettings(PolledHeadSettings):
         command_delay_s: time from a command to the start of motion of head and lens, as measured [s].
     """
 
-    host: Annotated[str, Needed("192.168.0.88")] = ""
+    host: Annotated[str, Needed("192.168.0.88"), Check(_host)] = ""
     port: Annotated[int, Interval(ge=0, le=65535)] = 0
     url: Annotated[str, Needed(EXAMPLE), Check(stream_address)] = ""
     user: str = ""

@@ -166,8 +166,7 @@ class Device:
             ConfigError: the settings lack what is needed to find the device.
             DeviceError: the device is not there, or does not answer.
         """
-        if missing_key(self.settings):
-            raise ConfigError("is not configured")
+        self.refuse_missing()
         if not hasattr(self.driver, "probe"):
             return None
         lock = rig_lock(*addresses_of(self.settings)) if self.role in ("head", "ptz") else contextlib.nullcontext()

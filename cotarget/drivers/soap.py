@@ -219,10 +219,11 @@ class SoapClient:
             raise LoginFaultError(self.name, message, error.codes, self._why_refused()) from None
 
     def _why_refused(self) -> str:
-        who = f"the user '{self._user}'" if self._user else "it without a user"
+        if not self._user:
+            return f"no user is given: {self._remedy}"
         off = self.clock_off_s
         clock = f"; its clock is {off:.0f} s ahead of this machine's" if abs(off) > CLOCK_S else ""
-        return f"not for {who}: {self._remedy}{clock}" if self._user else f"{who}: {self._remedy}"
+        return f"not for the user '{self._user}': {self._remedy}{clock}"
 
     def _ask_clock(self, deadline: float) -> float:
         """Ask for the device's time; return by how much it is ahead [s]."""

@@ -12,11 +12,11 @@ import time
 
 import pytest
 
-from cotarget.config import SafetyConfig
+from cotarget.config import SafetyConfig, parse_config
 from cotarget.drivers import onvif
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.onvif import OnvifDevice, OnvifDome, OnvifLink
-from cotarget.drivers.rig import device_of
+from cotarget.drivers.rig import device_of, devices
 from cotarget.emulators.onvif import ANSWERS, PAN_TILT, TPTZ, TRT, OnvifCamera, SoapFault
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
@@ -580,7 +580,7 @@ def test_a_dome_that_cannot_be_driven_is_named_in_one_line(profile, said, monkey
 
 @pytest.mark.parametrize(("changes", "said"), [
     ({"password": "wrong"}, "not for the user 'root': check hardware.ptz.user and the password, which may be in"),
-    ({"user": "", "password": ""}, "it without a user: check hardware.ptz.user"),
+    ({"user": "", "password": ""}, "no user is given: check hardware.ptz.user"),
     ({"profile": "other"}, "hardware.ptz.profile: .* has no 'other' that moves; valid here: profile_1"),
     ({"port": 1}, r"cannot be reached \(Connection refused\): check host and port"),
     ({"host": "nowhere.invalid"}, "cannot be reached"),
@@ -604,6 +604,20 @@ def test_an_address_of_the_stream_that_is_none_is_named_in_one_line(address, mon
         assert "hardware.ptz.url: the address that the device at" in refused(unit)
         with opened(unit, url=unit.stream.url) as dome:
             assert dome.zoom.read(timeout=10.0).image.shape == (240, 320, 3)
+
+
+@pytest.mark.parametrize(("keys", "said"), [
+    ({"host": "192.168.0.88:8000"}, 'hardware.ptz.host: .* write host = "192.168.0.88" and port = 8000'),
+    ({"host": "http://dome/onvif/device_service"}, 'hardware.ptz.host: .* write host = "dome"$'),
+    ({"host": "root:hunter2@dome"}, "hardware.ptz.host: has a user or a password in it; write user ="),
+    ({"url": "rtsp://root:hunter2@dome/1"}, "hardware.ptz.url: has a user or a password in it; write user ="),
+])  # fmt: skip
+def test_an_address_with_more_in_it_is_refused_without_its_password(keys, said):
+    with pytest.raises(ConfigError, match=said) as caught:
+        devices(parse_config({"backend": "hardware", "hardware": {"ptz": {"driver": "onvif"} | keys}}).hardware)
+    assert "hunter2" not in str(caught.value)
+    plain = {"driver": "onvif", "host": "fe80::1"}
+    devices(parse_config({"backend": "hardware", "hardware": {"ptz": plain}}).hardware)
 
 
 def test_another_protocol_at_the_port_is_named():
