@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, cast
 
 from cotarget.cli.common import RIG, port
 from cotarget.errors import ConfigError, CotargetError
-from cotarget.safety.stop_file import locate_stop_file, refuse_if_stopped
+from cotarget.safety.stop_file import refuse_if_stopped, session_stop_file
 
 if TYPE_CHECKING:
     import socket
@@ -82,7 +82,7 @@ class PageRun:
         self._options, self._config = options, config
         self._stop_file: Path | None = config.safety.stop_file
         if self._stop_file is None and config.backend != HARDWARE:
-            self._stop_file = locate_stop_file(options.rig, HARDWARE, None)
+            self._stop_file = session_stop_file(options.rig)
         refuse_if_stopped(self._stop_file)
         self.safety: SafetyConfig = config.safety
         if not spec.real_time and config.backend != HARDWARE:

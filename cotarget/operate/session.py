@@ -70,8 +70,7 @@ class Session:
         self.control: str | None = None
         self._rig, self._run, self._config, self._now, self._records = rig, run, config, now, records
         self._stop_file = stop_file
-        # A rig in real time watches its stop file by itself; in a simulation the run asks between two frames.
-        self._look = StopLook(None if rig.spec.real_time else stop_file)
+        self._look, self._in_file = StopLook(stop_file), False  # whether the stop was in its file at the frame before
         self._lock = threading.Lock()
         self._orders: list[Order] = [Order("stand", HEAD)]
         self._turning: dict[str, tuple[tuple[float, float], float]] = {}  # rates by head, and when they end
@@ -148,7 +147,7 @@ class Session:
         self._give(Order("home", head), by)
 
     def stop(self, reason: str) -> None:
-        """Stop all heads, and keep them stopped until `clear`; anybody may.
+        """Stop all heads, and keep them stopped until `clear` or `cotarget clear`; anybody may.
 
         Raises:
             DeviceError: the stop file cannot be written; this run is stopped all the same.
@@ -284,12 +283,16 @@ class Session:
 
     def _due(self) -> list[Order]:
         """Take the orders that the run obeys with the newest frame, and record them."""
-        there = self._look.reason() or self._rig.stopped
+        # A rig in real time watches its stop file by itself; that another program has removed it is seen here alone.
+        looks = self.stopped is not None or not self._rig.spec.real_time
+        in_file = self._look.reason() if looks else None
+        there = in_file or self._rig.stopped
         with self._lock:  # a stop that comes meanwhile writes its file after that of the last was removed
             orders, self._orders = self._orders, []
+            removed, self._in_file = self._in_file and in_file is None, in_file is not None
             if any(each.kind == "stop" for each in orders):  # later than any Clear
                 orders = [each for each in orders if each.kind == "stop"]
-            elif self._to_clear and self._is_file_cleared():
+            elif (self._to_clear and self._is_file_cleared()) or (self.stopped is not None and removed):
                 orders, self.stopped = [Order("clear")], None
             elif self.stopped is None and there is not None:  # by another program
                 orders, self.stopped = [Order("stop", reason=there)], there

@@ -7,6 +7,7 @@ after it has drawn the last, so that a slow one delays nobody. docs/page.md says
 """
 
 import asyncio
+import errno
 import hmac
 import http
 import ipaddress
@@ -87,6 +88,8 @@ def listen(host: str, port: int) -> socket.socket:
         listener.listen()  # listen now, before another program can take the port
     except OSError as error:
         listener.close()
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise DeviceError(f"--page-host {host}: is no address of this machine; give one of its own") from None
         raise DeviceError(
             f"--page-port {port}: {error.strerror}; give another one, or 0 for any that is free"
         ) from None

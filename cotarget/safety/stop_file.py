@@ -56,7 +56,7 @@ def locate_stop_file(rig: Path, backend: object, said: object) -> Path | None:
 
 
 def find_stop_file(rig: Path) -> Path:
-    """Find the stop file of a rig.toml, even in one that is invalid otherwise.
+    """Find the stop file of a rig.toml, even in one that is invalid otherwise; or that of a simulation with a page.
 
     Raises:
         ConfigError: the file cannot be read, or the rig has no stop file.
@@ -65,6 +65,8 @@ def find_stop_file(rig: Path) -> Path:
     try:
         text = rig.read_bytes().decode("utf-8-sig", "replace")
     except OSError as error:
+        if isinstance(error, FileNotFoundError) and (path := _stop_file_of_session(rig)) is not None:
+            return path
         raise ConfigError(f"{rig}: {error.strerror}; {by_hand}") from None
     try:
         tables = tomllib.loads(text)
@@ -78,10 +80,23 @@ def find_stop_file(rig: Path) -> Path:
             raise ConfigError(f"{rig}: is not TOML: {error}; {by_hand}") from None
     if not isinstance(said, str | None) and said is not False:
         raise ConfigError(f'{rig}: safety.stop_file: {said!r} is not a text; name a file, as "stop"')
-    path = locate_stop_file(rig, backend, said)
+    path = locate_stop_file(rig, backend, said) or _stop_file_of_session(rig)
     if path is None or path.name in ("", "..") or path == rig.absolute().parent:
         raise ConfigError(f'{rig}: has no stop file; give one: [safety] stop_file = "stop"')
     return path
+
+
+def session_stop_file(rig: Path) -> Path:
+    """Return the stop file that a simulation has while it is steered from a page: RIG.stop beside rig.toml."""
+    path = locate_stop_file(rig, "hardware", None)
+    assert path is not None, "that of real devices"
+    return path
+
+
+def _stop_file_of_session(rig: Path) -> Path | None:
+    """Return that file if it stops the simulation, or if a program watches it; else None."""
+    path = session_stop_file(rig)
+    return path if path.exists() or same_place(path) in watched_stop_files() else None
 
 
 def stop_reason(path: Path | None) -> str | None:

@@ -44,6 +44,17 @@ def test_a_stop_survives_a_restart(folder, capsys):
     assert "rig.stop" in said
 
 
+@pytest.mark.parametrize("text", [None, 'backend = "sim"'], ids=["without rig.toml", "simulation"])
+def test_what_a_refused_restart_names_clears_the_stop(folder, capsys, text):
+    """A simulation has a stop file only by its page, and that of the demo has no rig.toml beside it."""
+    if text is not None:
+        (folder / "rig.toml").write_text(text)
+    assert "rig.toml: " in refused(capsys, "clear", "--rig", "rig.toml")
+    (folder / "rig.stop").write_text("a hand in the gears\n")
+    assert call(capsys, "clear", "--rig", "rig.toml") == (0, "cleared: a hand in the gears\n", "")
+    assert not (folder / "rig.stop").exists()
+
+
 def refused_after_remark(capsys, *options):
     status, out, err = call(capsys, "follow", "--page", *options)
     assert (status, out) == (1, "")

@@ -10,12 +10,12 @@ from cotarget.backends import open_recording
 from cotarget.calibration import Calibration
 from cotarget.config import FollowConfig
 from cotarget.control.orders import Order, order_row, parse_order
-from cotarget.errors import ConfigError, EmergencyStopError
+from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 from cotarget.operate.session import ControlError
 from cotarget.pipeline import Mode, Run, State
 from cotarget.recording.replay import Replay, until_end
 from cotarget.safety.safe_rig import guard
-from cotarget.safety.stop_file import write_stop_file
+from cotarget.safety.stop_file import clear_stop_file, write_stop_file
 from tests.support.operated_run import HandDevices, operate
 from tests.support.recorded_run import CONFIG, FOCALS, SETTINGS, STEP, Bright, ToyDevices, calibration_file
 from tests.support.rigs import rig_of
@@ -289,6 +289,42 @@ def test_a_stop_by_another_program_stops_a_simulation_too(path, tmp_path):
 
     steps = operate(path, 50, act, stop_file=file)
     assert {step.state for step in steps[32:]} == {State.STANDING}
+
+
+@pytest.mark.parametrize("real_time", [False, True], ids=["simulated", "real time"])
+def test_another_program_clears_a_stop_and_then_the_head_stands(path, tmp_path, real_time):
+    file, said = tmp_path / "rig.stop", {}
+
+    def act(i, session, wall, rig):
+        if i in (0, 60):
+            session.follow("head")
+        if i == 20:
+            session.stop("a hand in the gears")
+        if i == 30:
+            assert clear_stop_file(file) == "a hand in the gears"
+        if i == 40:  # the next stop is another one
+            session.stop("once more")
+        if i == 50:
+            session.clear()
+        said[i] = session.stopped
+
+    guard_file = file if real_time else None
+    steps = operate(path, 70, act, stop_file=file, guard_file=guard_file, devices=ToyDevices(real_time=real_time))
+    assert [said[i] for i in (29, 32, 49, 52)] == ["a hand in the gears", None, "once more", None]
+    assert {step.state for step in steps[21:61]} == {State.STANDING}
+    assert steps[-1].state in FOLLOWED
+
+
+def test_a_stop_without_its_file_lasts(path, tmp_path):
+    """No file of a stop is no Clear: that of this one cannot be written."""
+
+    def act(i, session, wall, rig):
+        if i == 10:
+            with pytest.raises(DeviceError, match="NOT stopped"):
+                session.stop("the disk is gone")
+
+    steps = operate(path, 20, act, stop_file=tmp_path / "gone" / "rig.stop")
+    assert steps[-1].reason == "the disk is gone"
 
 
 # Recordings

@@ -330,6 +330,11 @@ def test_all_addresses_have_no_name_to_check(host):
         listen(host, 0)
 
 
+def test_an_address_of_another_machine_is_refused_by_its_name():
+    with pytest.raises(DeviceError, match="--page-host 192.0.2.1: "):  # of documentation alone, RFC 5737
+        listen("192.0.2.1", 0)
+
+
 def test_by_itself_it_listens_on_loopback_alone(at):
     assert at.page._listener.getsockname()[0] == LOOPBACK
 
