@@ -56,7 +56,7 @@ MOST_STRANGERS = 32  # connections without the token
 MOST_SENTENCES = 16  # that wait for a slow line
 TICK_S = 0.1  # period of ticks
 RATE_HZ, BURST = 60.0, 120.0  # messages of one browser: in the long run, and at once
-REFUSED, TOO_MUCH = 4401, 1008  # closing codes: without the token; against the rules
+REFUSED, ENDED, TOO_MUCH = 4401, 4410, 1008  # closing codes: without the token; with the run; against the rules
 CLOSE_S = 1.0  # time for a closing handshake
 PING_S = 2.0  # period of asking whether a browser is there, and time for its answer
 LINE_S = 3.0  # time for the thread to start and to end
@@ -237,6 +237,8 @@ class Page:
             self._started.set()
             await self._ended.wait()
             ticking.cancel()
+            ending = (client.socket.close(ENDED, "the run has ended") for client in list(self._clients))
+            await asyncio.gather(*ending, return_exceptions=True)
 
     def _admit(self, connection: Any) -> None:
         """Note a new connection; beyond the most of them, the oldest without the token is closed."""

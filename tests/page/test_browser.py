@@ -124,10 +124,20 @@ def test_arrow_keys_turn_while_they_are_held(browser, at):
     assert len(noted(at, "manual")) == count
 
 
-def test_what_is_held_ends_when_the_page_loses_the_focus(browser, at):
+@pytest.mark.parametrize(
+    "left",
+    [
+        "dispatchEvent(new Event('blur'))",
+        "Object.defineProperty(document, 'hidden', { value: true, configurable: true });"
+        "document.dispatchEvent(new Event('visibilitychange'))",
+        "dispatchEvent(new Event('pagehide'))",
+    ],
+    ids=["focus", "hidden", "left"],
+)
+def test_what_is_held_ends_when_the_page_is_left(browser, at, left):
     browser.key("ArrowUp", "keyDown")
     until(lambda: noted(at, "manual"))
-    browser.js("dispatchEvent(new Event('blur'))")
+    browser.js(left)
     until(lambda: noted(at, "stand"))
     count = len(noted(at, "manual"))
     time.sleep(0.5)
@@ -242,7 +252,10 @@ def test_without_a_connection_it_says_in_large_letters_that_it_cannot_stop(brows
     with served() as made:
         browser.open(made.page.link)
         until(lambda: browser.text("control") == "You have control.")
-    until(lambda: "cannot stop" in browser.text("offline-text"))
+        browser.js("socket.close()")
+        until(lambda: browser.text("offline-text") == "No connection: this page cannot stop the head.")
+        until(lambda: browser.text("offline-text") == "")  # it has connected again
+    until(lambda: browser.text("offline-text") == "The run has ended: this page cannot stop the head.")
     assert browser.js("parseFloat(getComputedStyle(document.getElementById('offline')).fontSize)") >= 28
     assert browser.js("getComputedStyle(document.getElementById('offline')).display") == "block"
 
@@ -277,6 +290,9 @@ def test_it_fits_and_does_not_jump(browser, at, width, tmp_path):
             "newest.heads.head.predicted = {error_px: 1234.5, at: [0, 0], axes: [1, 1], turn: 0};"
             "tell(newest); text('say', 'Something was said.')"
         )
+        assert browser.js("document.documentElement.scrollHeight") == before
+        at.session.stopped = STOP[1]
+        until(lambda: browser.text("latched"))
         assert browser.js("document.documentElement.scrollHeight") == before
         top = browser.js("document.getElementById('stop').getBoundingClientRect().top")
         browser.js("scrollTo(0, 500)")

@@ -7,10 +7,12 @@ import json
 import logging
 import re
 import socket
+import threading
 import time
 
 import pytest
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import Frame, Opcode
 from websockets.sync.client import connect
 
 from cotarget.errors import ConfigError, DeviceError
@@ -111,6 +113,17 @@ def test_strangers_give_way_so_that_nobody_is_locked_out_of_stop(at):
             raws[0].settimeout(1.0)
             with contextlib.suppress(ConnectionResetError):
                 assert raws[0].recv(1) == b""  # the oldest went
+
+
+def test_who_has_shown_the_token_gives_way_to_no_stranger(at):
+    with browser(at) as mine, contextlib.ExitStack() as stack:
+        status(mine)
+        for _ in range(MOST_STRANGERS + 8):
+            stack.enter_context(socket.create_connection((LOOPBACK, at.port)))
+        with browser(at, who="b") as other:  # all of them have been let in
+            status(other)
+        say(mine, do="stop")
+        until(lambda: STOP in at.session.noted)
 
 
 def test_the_token_is_in_no_log(at, caplog):
@@ -254,6 +267,37 @@ def test_a_stop_is_counted_by_nobody(at):
         assert status(mine, lambda message: message["stopped"] is not None)["stopped"] == STOP[1]  # older ones may wait
 
 
+def test_a_stop_waits_for_no_picture(at, monkeypatch):
+    packing, leave = threading.Event(), threading.Event()
+    monkeypatch.setattr(server, "pack", lambda *_: packing.set() or leave.wait(DEADLINE_S) or b"")
+    with browser(at) as mine:
+        at.page.show(step(), SPEC)
+        assert packing.wait(DEADLINE_S)
+        say(mine, do="stop")
+        try:
+            until(lambda: STOP in at.session.noted)
+        finally:
+            leave.set()
+
+
+def test_a_stop_that_takes_long_delays_nobody_else():
+    leave = threading.Event()
+
+    class Slow(NotingSession):
+        def stop(self, reason):
+            super().stop(reason)
+            leave.wait(DEADLINE_S)
+
+    with served(Slow()) as slow, browser(slow) as mine, browser(slow, who="b") as other:
+        say(mine, do="stop")
+        try:
+            until(lambda: STOP in slow.session.noted)
+            first = status(other)["tick"]
+            status(other, lambda message: message["tick"] > first + 2)
+        finally:
+            leave.set()
+
+
 def test_sockets_are_not_compressed(at):
     with connect(f"ws://{LOOPBACK}:{at.port}/socket", origin=f"http://{LOOPBACK}:{at.port}") as socket:
         assert socket.response.headers.get("Sec-WebSocket-Extensions") is None
@@ -315,6 +359,27 @@ def test_a_closed_page_leaves_control_unless_it_is_open_twice(at):
     until(lambda: at.session.noted == [("leave", "a"), ("left alone",)])
 
 
+def test_a_browser_that_no_longer_answers_has_left(monkeypatch):
+    """Its line is cut, and the system does not know yet."""
+    monkeypatch.setattr(server, "PING_S", 0.2)
+    with served() as at, socket.create_connection((LOOPBACK, at.port)) as raw:
+        lines = ("GET /socket HTTP/1.1", "Host: localhost", "Origin: http://localhost", *UPGRADE, "")
+        raw.sendall("".join(f"{line}\r\n" for line in lines).encode())
+        for message in ({"do": "hello", "token": at.page.token, "who": "a"}, {"do": "take"}):
+            raw.sendall(Frame(Opcode.TEXT, json.dumps(message).encode()).serialize(mask=True))
+        until(lambda: at.session.control == "a")
+        until(lambda: at.session.noted == [("leave", "a"), ("left alone",)])
+
+
+def test_the_end_of_the_run_is_no_lost_connection():
+    with contextlib.ExitStack() as stack:
+        at = stack.enter_context(served())
+        with browser(at) as mine:
+            status(mine)
+            stack.close()
+            assert closed(mine) == 4410
+
+
 # Addresses
 
 
@@ -331,7 +396,7 @@ def test_all_addresses_have_no_name_to_check(host):
 
 
 def test_an_address_of_another_machine_is_refused_by_its_name():
-    with pytest.raises(DeviceError, match="--page-host 192.0.2.1: "):  # of documentation alone, RFC 5737
+    with pytest.raises(DeviceError, match=r"--page-host 192\.0\.2\.1: "):  # of documentation alone, RFC 5737
         listen("192.0.2.1", 0)
 
 
