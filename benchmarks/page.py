@@ -16,6 +16,7 @@ import asyncio
 import contextlib
 import itertools
 import json
+import logging
 import math
 import multiprocessing
 import os
@@ -48,6 +49,7 @@ from cotarget.page.html import render
 from cotarget.page.server import LOOPBACK, Page, listen
 from cotarget.pipeline import Run, State, Step
 from cotarget.rig import Board, Camera, Clock, Frame, HeadSpec, PanTiltState, Rig, ZoomState
+from cotarget.safety import watchdog
 from cotarget.safety.safe_rig import guard
 from experiments.engine import Count, Row, Settings
 from experiments.wire.process import EmulatedRig
@@ -113,7 +115,7 @@ def needs(settings: PageSettings) -> str:
 def one(settings: PageSettings, seed: int) -> list[Row]:
     """Time pictures beside each, then orders and turns; give a row for each."""
     rows: list[Row] = [{"figure": "bytes", "value": len(render("page.html").encode())}]
-    with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser:
+    with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser, _stops_unreported():
         browser.size(1200, 900)
         browser.call("Network.disable")  # each picture would be reported here too
         rows += _beside_nothing(settings, browser)
@@ -121,6 +123,18 @@ def one(settings: PageSettings, seed: int) -> list[Row]:
         if settings.rendered:
             rows += _beside_rendering(settings, browser, Path(folder) / "emulated", seed)
     return [row | {"seed": seed, "load": load()} for row in rows]
+
+
+@contextlib.contextmanager
+def _stops_unreported() -> Iterator[None]:
+    """Keep the warning of each Stop off stderr, where they are given on purpose; errors stay."""
+    log = logging.getLogger(watchdog.__name__)
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
 
 
 # Pictures

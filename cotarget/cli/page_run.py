@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import dataclasses
+import ipaddress
 import itertools
 import math
 import sys
@@ -119,20 +120,33 @@ class PageRun:
 
     def _announce(self, link: str, unattended: str) -> None:
         """Print the link, and what it means."""
-        goes_on = "following goes on" if unattended == "follow" else "the head stands"
-        lines = [
-            f"open {link}",
-            f"the head stands until the page says otherwise; when the last page closes, {goes_on}: "
-            f'[follow] unattended = "{unattended}"',
-        ]
-        if self._options.page_host is not None:
-            number = self._listener.getsockname()[1]
-            lines.append(
-                "there is no encryption: who can read this network can read pictures and token, and steer; safer is, "
-                f"without --page-host: ssh -L {number}:127.0.0.1:{number} {self._host}, and the link on your machine"
-            )
-        for line in lines:
+        address, number = self._listener.getsockname()[:2]
+        for line in announcement(link, unattended, self._host, address, number):
             print(f"cotarget follow: {line}", file=sys.stderr, flush=True)
+
+
+def announcement(link: str, unattended: str, host: str, address: str, number: int) -> list[str]:
+    """List what is said of a page at its start: its link, and what it means.
+
+    Args:
+        link: its link.
+        unattended: what happens when the last page closes, of [follow] in rig.toml.
+        host: name at which it is served.
+        address: address of that name; beyond loopback others can read what is sent.
+        number: number of the port.
+    """
+    goes_on = "following goes on" if unattended == "follow" else "the head stands"
+    lines = [
+        f"open {link}",
+        f"the head stands until the page says otherwise; when the last page closes, {goes_on}: "
+        f'[follow] unattended = "{unattended}"',
+    ]
+    if not ipaddress.ip_address(address).is_loopback:
+        lines.append(
+            "there is no encryption: who can read this network can read pictures and token, and steer; safer is, "
+            f"without --page-host: ssh -L {number}:127.0.0.1:{number} {host}, and the link on your machine"
+        )
+    return lines
 
 
 class Recordings(contextlib.AbstractContextManager["Recordings", None]):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from cotarget.cli.page_run import paced
+from cotarget.cli.page_run import announcement, paced
 from cotarget.page.server import LOOPBACK, listen
 from cotarget.pipeline import HeadRun
 from tests.support.commands import call, refused
@@ -31,6 +31,13 @@ def test_a_port_that_is_taken_costs_one_line(folder, capsys):
     with listen(LOOPBACK, 0) as taken:
         said = refused_after_remark(capsys, "--page-port", taken.getsockname()[1])
     assert "--page-port" in said
+
+
+@pytest.mark.parametrize(("address", "warns"), [("127.0.0.1", False), ("::1", False), ("192.0.2.1", True)])
+def test_beyond_loopback_it_says_that_others_can_read_and_names_the_tunnel(address, warns):
+    lines = announcement("http://rig:8081/#token", "follow", "rig", address, 8081)
+    assert lines[0] == "open http://rig:8081/#token"
+    assert any("no encryption" in line and "ssh -L 8081:127.0.0.1:8081 rig" in line for line in lines) == warns
 
 
 def test_a_demo_without_its_target_is_refused(folder, capsys):
