@@ -3,6 +3,7 @@
 import itertools
 import math
 import threading
+from functools import partial
 
 import pytest
 
@@ -177,8 +178,14 @@ def test_only_who_has_control_gives_orders(path):
             for order in (session.stand, session.home, session.follow):
                 with pytest.raises(ControlError):
                     order("head", by="b")
-            with pytest.raises(ControlError):
-                session.clear(by="b")
+            for order in (
+                partial(session.manual, "head", (1.0, 0.0)),
+                partial(session.zoom, "head", 2.0),
+                partial(session.record, True),
+                session.clear,
+            ):
+                with pytest.raises(ControlError):
+                    order(by="b")
         if i == 10:
             session.take("b")  # the heads of whoever had it stand
         if i == 12:
@@ -197,6 +204,8 @@ def test_lost_control_ends_moving_by_hand_and_not_following(path):
             session.manual("head", (PART, 0.0), by="a")
         if i == 9:
             session.leave("a")
+            with pytest.raises(ControlError):
+                session.home("head", by="a")
         if i == 12:
             assert session.mode("head") is Mode.STANDING
             session.take("a")
@@ -289,6 +298,27 @@ def test_a_stop_by_another_program_stops_a_simulation_too(path, tmp_path):
 
     steps = operate(path, 50, act, stop_file=file)
     assert {step.state for step in steps[32:]} == {State.STANDING}
+
+
+def test_a_stop_in_real_time_waits_for_no_frame(path, tmp_path):
+    """The head is halted while the run works on a frame."""
+    devices, sessions, halts = ToyDevices(real_time=True), [], []
+    detect = Bright.detect
+
+    def act(i, session, wall, rig):
+        sessions[:] = [session]
+
+    def stopping(self, frame, held=()):
+        if sessions and not halts:
+            before = devices.calls["head.halt"]
+            sessions[0].stop("a hand in the gears")
+            halts.append(devices.calls["head.halt"] - before)
+        return detect(self, frame, held)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Bright, "detect", stopping)
+        operate(path, 5, act, devices=devices)
+    assert halts == [1]
 
 
 @pytest.mark.parametrize("real_time", [False, True], ids=["simulated", "real time"])

@@ -172,6 +172,11 @@ def test_only_the_page_itself_opens_a_socket(at, origin):
     assert said.startswith("HTTP/1.1 403"), said
 
 
+def test_two_origins_open_no_socket(at):
+    lines = ("Host: localhost", "Origin: http://localhost", "Origin: http://evil.example", *UPGRADE)
+    assert ask(at, "GET /socket HTTP/1.1", *lines).startswith("HTTP/1.1 403")
+
+
 # Requests
 
 
@@ -231,6 +236,7 @@ def test_a_page_is_small_and_writes_no_markup(name):
         '{"do": "zoom", "of": "head", "factor": 100.0, "tick": 1}',
         '{"do": "follow", "of": "head", "click": [1e300, 0]}',
         '{"do": "follow", "of": "head", "track": true}',
+        json.dumps({"do": "stand", "of": "h" * 65}),
         "[" * 2000,
     ],
 )
@@ -336,6 +342,8 @@ def test_others_watch_and_may_stop_but_not_clear_or_move(at):
             {"do": "stand", "of": "head"},
             {"do": "follow", "of": "head", "track": 1},
             {"do": "manual", "of": "head", "rates": [1, 0], "tick": tick},
+            {"do": "zoom", "of": "head", "factor": 2, "tick": tick},
+            {"do": "record", "on": True},
         ):
             say(other, **order)
             assert "control" in sentence(other)
