@@ -10,12 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from cotarget.config import FollowConfig
 from cotarget.control.orders import MANUAL_S, Order
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.pipeline import HEAD, Mode, Run, State, Step
 from cotarget.rig import Rig
 from cotarget.safety.stop_file import StopLook, clear_stop_file, write_stop_file
+
+CONFIRMED_S = 0.3  # until a new run has confirmed a track: 0.24 to 0.36 s in the demo
 
 
 class ControlError(CotargetError):
@@ -275,7 +279,8 @@ class Session:
         if before.mode is Mode.FOLLOWING and before.selector is before.policy:
             order = Order("follow", HEAD)
         elif before.mode is Mode.FOLLOWING and step.target is not None:  # tracks have new numbers
-            u, v = step.target.center_px.tolist()
+            ahead = step.target.center_px + step.target.velocity_px * CONFIRMED_S
+            u, v = np.clip(ahead, 0, np.array(self._rig.fixed.size) - 1).tolist()
             order = Order("follow", HEAD, click=(u, v))
         with self._lock:
             self._orders.insert(0, order)

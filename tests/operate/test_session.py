@@ -5,6 +5,8 @@ import math
 import threading
 from functools import partial
 
+import cv2
+import numpy as np
 import pytest
 
 from cotarget.backends import open_recording
@@ -18,7 +20,17 @@ from cotarget.recording.replay import Replay, until_end
 from cotarget.safety.safe_rig import guard
 from cotarget.safety.stop_file import clear_stop_file, write_stop_file
 from tests.support.operated_run import HandDevices, operate
-from tests.support.recorded_run import CONFIG, FOCALS, SETTINGS, STEP, Bright, ToyDevices, calibration_file
+from tests.support.recorded_run import (
+    CONFIG,
+    FOCALS,
+    RATE_HZ,
+    SETTINGS,
+    SIZE,
+    STEP,
+    Bright,
+    ToyDevices,
+    calibration_file,
+)
 from tests.support.rigs import rig_of
 
 FRAMES = 60
@@ -259,6 +271,7 @@ def stop_and_clear(i, session, wall, rig):
         session.manual("head", (1.0, 0.0))
     if i == 50:
         session.clear()
+        session.manual("head", (1.0, 0.0))  # before the next frame, with which the stop ends
     if i == 70:
         session.follow("head")
 
@@ -358,6 +371,30 @@ def test_a_stop_without_its_file_lasts(path, tmp_path):
 
 
 # Recordings
+
+
+@pytest.mark.parametrize("target", [None, 1], ids=["by the policy", "by its number"])
+def test_a_target_that_is_followed_fast_is_followed_in_the_new_run_of_a_recording_too(path, target):
+    devices = ToyDevices()
+    first = round(devices.t * RATE_HZ)
+
+    def expose(index):  # 87 px/s in an image of 96 px
+        image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+        return cv2.circle(image, (round(4 + 3.5 * (index - first)), 36), 4, (250, 250, 250), -1)
+
+    devices.fixed.expose = expose
+
+    def act(i, session, wall, rig):
+        if i == 6:
+            session.follow("head", target)
+        if i == 12:
+            assert session.mode("head") is Mode.FOLLOWING
+            session.record(True)
+
+    steps = operate(path, 24, act, devices=devices)
+    assert steps[12].state in FOLLOWED
+    assert steps[14].target is None  # tracks begin again
+    assert steps[-1].state in FOLLOWED
 
 
 def everything(i, session, wall, rig):

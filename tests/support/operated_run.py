@@ -47,6 +47,23 @@ class Wall:
         return self.t
 
 
+class Unkept:
+    """Records of a session that are kept nowhere."""
+
+    def __init__(self, make_run):
+        self.folder, self._make_run = "", make_run
+
+    def add(self, order):
+        pass
+
+    def begin(self):
+        self.folder = "unkept"
+        return self._make_run()
+
+    def end(self):
+        self.folder = ""
+
+
 # A busy machine may not look at the stop file for longer than a run allows.
 @patch("cotarget.safety.stop_file.MOST_MISSED", 200)
 def operate(path, steps, act, *, folder=None, stop_file=None, config=None, devices=None, guard_file=None):
@@ -63,9 +80,12 @@ def operate(path, steps, act, *, folder=None, stop_file=None, config=None, devic
         if recorder:
             safe = recorded.with_refusals(safe)
         with safe:
-            run = Run(safe, Calibration.load(path), CONFIG.target("bird"), Bright(), settings=SETTINGS)
-            records = SimpleNamespace(add=recorder.add, folder=str(folder)) if recorder else None
-            session = Session(safe, run, stop_file, config or FollowConfig(), wall, records)
+
+            def make():
+                return Run(safe, Calibration.load(path), CONFIG.target("bird"), Bright(), settings=SETTINGS)
+
+            records = SimpleNamespace(add=recorder.add, folder=str(folder)) if recorder else Unkept(make)
+            session = Session(safe, make(), stop_file, config or FollowConfig(), wall, records)
             for i, step in enumerate(session.steps(math.inf)):
                 done.append(step)
                 if i + 1 == steps:
