@@ -13,6 +13,7 @@ from cotarget.errors import DeviceError
 from cotarget.page.html import render
 from cotarget.page.server import Page, listen
 from cotarget.pipeline import State
+from tests.support import page_client
 from tests.support.page_client import SPEC, NotingSession, served, step
 
 pytestmark = [
@@ -248,6 +249,33 @@ def test_others_are_seen_to_take_control(browser, at):
     until(lambda: noted(at, "stop") == [STOP])
 
 
+def test_a_page_that_is_opened_takes_control_from_nobody(browser):
+    with served() as made, page_client.browser(made) as first:
+        page_client.say(first, do="take")
+        page_client.status(first, lambda message: message["control"] == "you")
+        browser.open(made.page.link)
+        until(lambda: browser.text("control") == "Another page has control.")
+        assert browser.js("document.getElementById('home').disabled")
+        assert page_client.status(first, lambda message: message["pages"] == 2)["control"] == "you"
+        browser.click("take")
+        page_client.status(first, lambda message: message["control"] == "another")
+        until(lambda: browser.text("control") == "You have control.")
+        browser.open("about:blank")
+
+
+def test_a_page_without_an_answer_says_that_it_may_not_stop(browser, at):
+    browser.js("socket.onmessage = null")
+    until(lambda: "may not be able to stop" in browser.text("offline-text"))
+    assert browser.js("document.getElementById('stop').disabled")
+
+
+def test_a_browser_without_websocket_says_so(browser, at):
+    script = browser.call("Page.addScriptToEvaluateOnNewDocument", source="delete window.WebSocket")["identifier"]
+    browser.js("location.reload()")
+    until(lambda: "no WebSocket" in browser.text("offline-text"))
+    browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
+
+
 def test_without_a_connection_it_says_in_large_letters_that_it_cannot_stop(browser):
     with served() as made:
         browser.open(made.page.link)
@@ -274,6 +302,8 @@ def test_it_connects_at_an_address_of_ipv6(browser):
 def test_an_old_link_and_none_say_so(browser, at):
     browser.js("sessionStorage.setItem('token', 'old'); location.reload()")
     until(lambda: browser.text("offline-text") == "This link is old.")
+    browser.js(f"location.hash = '{at.page.token}'")  # a new link in the old tab
+    until(lambda: browser.text("control") == "You have control.")
     browser.js("sessionStorage.removeItem('token'); location.reload()")
     until(lambda: "no token" in browser.text("offline-text"))
 
