@@ -239,6 +239,8 @@ class Page:
             ticking.cancel()
             ending = (client.socket.close(ENDED, "the run has ended") for client in list(self._clients))
             await asyncio.gather(*ending, return_exceptions=True)
+            for stranger in list(self._strangers):  # a browser's spare connection would be awaited for `HELLO_S`
+                stranger.transport.abort()
 
     def _admit(self, connection: Any) -> None:
         """Note a new connection; beyond the most of them, the oldest without the token is closed."""

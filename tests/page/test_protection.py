@@ -103,6 +103,15 @@ def test_a_connection_that_asks_for_nothing_is_closed_after_2_s(at):
         assert raw.recv(1) == b""
 
 
+def test_the_end_of_the_page_waits_for_no_connection_that_asks_for_nothing():
+    with contextlib.ExitStack() as stack:
+        with served() as made:
+            stack.enter_context(socket.create_connection((LOOPBACK, made.port)))
+            until(lambda: made.page._strangers)
+            begun = time.monotonic()
+        assert time.monotonic() - begun < 1.0  # the connection itself would be closed after 2 s
+
+
 def test_strangers_give_way_so_that_nobody_is_locked_out_of_stop(at):
     with contextlib.ExitStack() as stack:
         raws = [stack.enter_context(socket.create_connection((LOOPBACK, at.port))) for _ in range(MOST_STRANGERS + 8)]
