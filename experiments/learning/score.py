@@ -2,7 +2,7 @@
 
 The score is the share of good close-ups over all frames. Without a file, the pipeline and the proportional controller
 are scored. Policies of files, the proportional controller and the pipeline meet the same episodes, so that their
-difference is paired.
+difference is paired. `batch` is the score in the batch, over an episode in each of 256 environments.
 """
 
 import argparse
@@ -17,8 +17,10 @@ import numpy as np
 
 from cotarget.control.policy import OnnxPolicy, proportional
 from cotarget.env import FOLLOW_V1, PipelinePolicy
+from cotarget.env.batch import FollowBatch
 from cotarget.errors import ConfigError
 
+BATCH = 256
 FIRST_SEED, SEEDS = 1000, 50  # held out from training, whose paths have other seeds
 Policy = Callable[[Any], Any]
 
@@ -49,6 +51,19 @@ def score(target: str, policy: str, seeds: range, file: Path | None = None, rig:
     return scores
 
 
+def batch_score(target: str, file: Path | None, seed: int, rig: Path | None = None) -> float:
+    """Score a policy's file, or the proportional controller, in an episode of each environment of a batch."""
+    learnt = None if file is None else OnnxPolicy(file)
+    batch = FollowBatch(BATCH, target, "rates" if learnt is None else learnt.action, "yield", rig=rig)
+    act: Policy = proportional if learnt is None else learnt
+    observations, _ = batch.reset(seed=seed)
+    total = 0.0
+    for _ in range(batch.frames):
+        observations, rewards, *_ = batch.step(act(observations))
+        total += float(rewards.mean())
+    return total / batch.frames
+
+
 def main() -> None:
     """Print scores as JSON: means and paired differences to the pipeline, with half of their 95 % intervals."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -69,8 +84,9 @@ def main() -> None:
         for file in options.files or [None]:
             policy = "proportional" if file is None else "file"
             found = np.array(score(options.target, policy, seeds, file, options.rig))
-            ahead = mean_of(found - pipeline)
-            print(json.dumps({str(file or "proportional"): {**mean_of(found), "ahead": ahead}}), flush=True)
+            told = {**mean_of(found), "ahead": mean_of(found - pipeline)}
+            told["batch"] = round(batch_score(options.target, file, options.first_seed, options.rig), 4)
+            print(json.dumps({str(file or "proportional"): told}), flush=True)
     except ConfigError as error:
         parser.error(str(error))
 
