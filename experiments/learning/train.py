@@ -33,7 +33,6 @@ PPO_SETTINGS: dict[str, Any] = {
     "gamma": 0.95,
     "gae_lambda": 0.9,
     "learning_rate": lambda left: 7e-4 * max(left, 0.05),  # of the part of the steps that is left
-    "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.0},
 }
 CLONE_STEPS, CLONE_ROUNDS, CLONE_BATCH = 250, 1500, 4096
 RESIDUAL_GAIN = 0.01  # of the last layer, so that a residual begins near 0
@@ -101,6 +100,7 @@ def main() -> None:
     parser.add_argument("--start", default="scratch", choices=("scratch", "clone"))
     parser.add_argument("--randomize", action="store_true", help="vary delays, noise, lens and calibration")
     parser.add_argument("--steps", type=int, default=STEPS, help="of all environments together")
+    parser.add_argument("--log-std-init", type=float, default=-1.0, help="logarithm of the exploration's deviation")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("policy.onnx"))
     options = parser.parse_args()
@@ -116,7 +116,8 @@ def main() -> None:
         parser.error(str(error))
     env = BatchVecEnv(batch)
     normalized = VecNormalize(env, norm_reward=False, clip_obs=CLIP)
-    model = PPO("MlpPolicy", normalized, seed=options.seed, device="cpu", **PPO_SETTINGS)
+    network = {"net_arch": [64, 64], "log_std_init": options.log_std_init}
+    model = PPO("MlpPolicy", normalized, seed=options.seed, device="cpu", policy_kwargs=network, **PPO_SETTINGS)
     curve = Curve(env)
     if options.action == "residual":
         with torch.no_grad():
