@@ -130,7 +130,7 @@ def test_a_target_that_covers_two_fifths_of_the_image_is_found():
         [np.fliplr(background), background, np.fliplr(background)], axis=1
     )  # it comes in and leaves
     places = [None] * 15 + [(320 + 8 * i, 40) for i in range(80)]
-    pictures = [picture[:, 640:1280] for picture in moved(street, texture(*size, rng), places)]
+    pictures = (picture[:, 640:1280] for picture in moved(street, texture(*size, rng), places))
     right = [
         bool(on(each, np.array(place) - (640, 0) + np.array(size) / 2, 40))
         for each, place in zip(follow(pictures, rate, rng), places, strict=True)
