@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 SAME_SCALE, SAME_FOCAL, SCALE_PX = 0.015, 0.05, 640
 SURE_DEG = 0.2  # rms angle beyond which positions are not where the picture shows
 SHARE = 1.3  # of the largest distance from the goal that was seen: the next may be larger
+SAME_STOP_S = 0.1  # stops are measured to 0.03 s
 USUAL_DELAY_S = 0.05  # from a command to motion, where it is not seen apart from the picture's delay
 SHORTEST_S = 0.02  # no stream is faster
 SLOWER = 0.8  # of the highest speed, below which it depends on the zoom
@@ -99,6 +100,10 @@ def _keys(settings: "PtzSettings", found: "Characteristics", rig: "Rig") -> dict
     if speeds := _zoomed_speeds(found):
         keys["zoomed_speeds"] = speeds
     keys |= _delays(settings, found)
+    if found.stop_s is not None and hasattr(settings, "stop_delay_s"):
+        stop_delay_s = max(found.stop_s, 0.0)
+        if abs(stop_delay_s - settings.stop_delay_s) > SAME_STOP_S:
+            keys["stop_delay_s"] = round(stop_delay_s, 2)
     if found.missed_deg > getattr(settings, "slack_deg", math.inf) + max(settings.steps_deg):
         keys["slack_deg"] = round(SHARE * found.missed_deg, 2)
     if found.turns_at_zoom and hasattr(settings, "all_axes"):
@@ -166,6 +171,8 @@ def _words(settings: "PtzSettings", found: "Characteristics", keys: dict[str, An
         yield "It reports no positions while it moves."
     if found.stop_s is not None:
         yield f"It turns on for {max(found.stop_s + keys['command_delay_s'], 0.0):.2f} s after a halt."
+    if {"stop_delay_s", "slack_deg"} <= keys.keys():
+        yield "With stop_delay_s in rig.toml, and no slack_deg, characterize it again: it may be pointed more finely."
     if "zoomed_speeds" in keys:
         yield f"It turns by {keys['zoomed_speeds'][-1][1]:g} degrees/s at most when zoomed in."
     if found.turns_at_zoom:

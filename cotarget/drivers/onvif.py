@@ -89,6 +89,8 @@ class OnvifSettings(PtzSettings):
         speed_deg_s: speed of moves; the device turns so at its full speed [degrees/s].
         slack_deg: largest distance of the reported position from the goal where it has arrived [degrees].
         status_delay_s: by how much the positions that it reports are late, as measured [s].
+        stop_delay_s: time by which a stop takes longer than a start, as measured; counts where it is steered by
+            velocities [s].
         zoom_s: time that the lens takes from end to end [s].
         absolute: whether it obeys absolute moves of pan and tilt; false to steer it by velocities although it says so.
         all_axes: whether each move names pan, tilt and zoom; for a device that takes a missing one as 0.
@@ -98,6 +100,7 @@ class OnvifSettings(PtzSettings):
     profile: str = ""
     slack_deg: NotNegative = 0.1
     status_delay_s: NotNegative = 0.0
+    stop_delay_s: NotNegative = 0.0
     zoom_s: Positive = 10.0
     speed_deg_s: Positive = 100.0
     absolute: bool = True
@@ -550,7 +553,8 @@ class OnvifLink(PtzLink):
             self._coordinates = self._find_coordinates(status)
             self.axes = self._find_axes()
             self._reckoned = [ReckonedAxis(facts, settings.command_delay_s) for facts in self.axes]
-            self._steered = [SteeredAxis(facts, settings.command_delay_s) for facts in self.axes[:2]]
+            delays = settings.command_delay_s, settings.stop_delay_s
+            self._steered = [SteeredAxis(facts, *delays) for facts in self.axes[:2]]
             self._stepped, self._speeds = (SteppedAxis(), SteppedAxis()), (0.0, 0.0)
             self._renewed, self._timeout_s = -math.inf, self._find_timeout()
             self._seen, self._heard = status, clock.now()

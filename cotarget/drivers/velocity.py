@@ -5,6 +5,7 @@ Positions and speeds are in the numbers of the axis's facts. Times are on the ri
 
 from collections import deque
 from dataclasses import replace
+from itertools import pairwise
 
 from cotarget.drivers.axes import AxisFacts
 from cotarget.drivers.lens import LensMotion
@@ -13,6 +14,9 @@ SPEED_SHARE = 0.1  # relative standard deviation of a speed that was not measure
 SLOWEST = 1e-6  # a speed of zero would never arrive
 GAIN_HZ = 4.0  # of steering; above a third of the inverse of the unpredicted dead time it would overshoot
 FLOW_S = 0.5  # goals that follow each other as soon move along
+# Factor of the tolerance of an axis that goes beyond its goal, and back with each new goal; its limit, in slacks.
+WIDER, WIDEST = 1.5, 10.0
+SWINGS = 2  # beyond a goal that count as chance, such as by a late status
 FLOW_GAIN = 0.4  # by which the newest pair of goals changes their estimated speed
 MEASURED_DEG = 1.0  # shortest step from which it is measured how far the device goes
 GAINS = (0.1, 10.0)  # of a device's steps that are believed
@@ -65,18 +69,24 @@ class ReckonedAxis:
 class SteeredAxis:
     """Velocities that lead an axis to its goal, and along with goals that move.
 
-    The position is predicted from the newest one that the device has said and the velocities sent since.
+    The position is predicted from the newest one that the device has said and the velocities sent since. An axis that
+    turns on after a stop is stopped as much earlier. One that goes beyond a goal at rest all the same, again and again,
+    such as by its lowest speed, gets a wider tolerance for a while.
 
     Args:
         facts: of the axis.
         delay: time from a command to the start of motion [s].
+        stop_delay: time by which a stop takes longer [s].
     """
 
-    def __init__(self, facts: AxisFacts, delay: float) -> None:
-        self._facts, self._delay = facts, delay
+    def __init__(self, facts: AxisFacts, delay: float, stop_delay: float = 0.0) -> None:
+        self._facts, self._delay, self._stop_delay = facts, delay, stop_delay
         self._sent = deque([(0.0, 0.0)], maxlen=100)  # (time, velocity)
         self._goal: float | None = None
         self._limit, self._flow, self._aimed = facts.fastest, 0.0, -FLOW_S
+        self._tolerance = self._least = max(facts.slack / 2, facts.same)
+        self._swings = 0  # times that it has gone beyond the goal of now
+        self._turned = 0.0  # the velocity with which it last began to go to the goal of now
 
     @property
     def velocity(self) -> float:
@@ -90,11 +100,14 @@ class SteeredAxis:
             self._flow = 0.0
         elif passed > 0:
             self._flow += FLOW_GAIN * ((goal - self._goal) / passed - self._flow)
+        if goal != self._goal:
+            self._turned, self._swings = 0.0, 0
+            self._tolerance = max(self._tolerance / WIDER, self._least)
         self._goal, self._limit, self._aimed = goal, speed, now
 
     def stop(self, now: float) -> None:
         """Forget the goal; the axis was stopped."""
-        self._goal = None
+        self._goal, self._turned = None, 0.0
         self._sent.append((now, 0.0))
 
     def wanted(self, position: float, t: float, now: float) -> float:
@@ -111,21 +124,44 @@ class SteeredAxis:
         goal = self._goal + flow * (now - self._aimed)
         if not self._facts.lowest < goal < self._facts.highest:
             goal, flow = min(max(goal, self._facts.lowest), self._facts.highest), 0.0
-        error = goal - self._predicted(position, t, now)
-        if abs(error) <= max(self._facts.slack / 2, self._facts.same) and abs(flow) < GAIN_HZ * self._facts.slack:
-            return 0.0
-        return min(max(flow + GAIN_HZ * error, -self._limit), self._limit)
+        here, coast = self._predicted(position, t, now)
+        gain = GAIN_HZ
+        if abs(flow) < GAIN_HZ * self._facts.slack:  # the goal rests
+            left = goal - here - coast
+            ends = (
+                self.velocity == 0 or left * coast < 0 < (goal - here) * coast
+            )  # it stands, turns on, or goes too far
+            if abs(left) <= self._tolerance or (coast and ends):
+                return 0.0
+            gain = 1 / (1 / GAIN_HZ + self._stop_delay)
+        wanted = min(max(flow + gain * (goal - here), -self._limit), self._limit)
+        beyond = abs(goal - position)
+        if not flow and wanted * self._turned < 0 and beyond > self._facts.slack:
+            self._swings += 1
+            if self._swings > SWINGS:
+                self._tolerance = min(max(WIDER * self._tolerance, beyond / 2), WIDEST * self._facts.slack)
+        self._turned = wanted
+        return wanted
 
     def send(self, velocity: float, now: float) -> None:
         """Note a velocity that was sent."""
         self._sent.append((now, velocity))
 
-    def _predicted(self, position: float, t: float, now: float) -> float:
-        """Predict the position at which a command of now takes effect."""
-        ends = [*(begin for begin, _ in list(self._sent)[1:]), now]
-        for (begin, velocity), end in zip(self._sent, ends, strict=True):
-            position += velocity * max(end - max(begin, t - self._delay), 0.0)
-        return position
+    def _predicted(self, position: float, t: float, now: float) -> tuple[float, float]:
+        """Predict the position at which a command of now takes effect, and the way from there on if that is a stop."""
+        motions: list[tuple[float, float]] = []  # (begin, velocity)
+        for sent, velocity in self._sent:
+            begin = sent + self._delay + (0.0 if velocity else self._stop_delay)
+            while motions and motions[-1][0] >= begin:  # a stop that has not begun
+                motions.pop()
+            motions.append((begin, velocity))
+        takes_effect = now + self._delay
+        stops = motions[-1][0] if self.velocity == 0 else takes_effect + self._stop_delay
+        coast = 0.0
+        for (begin, velocity), (end, _) in pairwise([*motions, (max(stops, takes_effect), 0.0)]):
+            position += velocity * max(min(end, takes_effect) - max(begin, t), 0.0)
+            coast += velocity * max(end - max(begin, takes_effect), 0.0)
+        return position, coast
 
 
 class SteppedAxis:

@@ -66,6 +66,7 @@ def test_what_was_measured_becomes_keys(dome, capsys, monkeypatch):
     assert (keys["latency_s"], keys["command_delay_s"]) == (0.24, 0.06)
     assert keys["slack_deg"] >= 0.5
     assert keys["all_axes"] is True
+    assert keys["stop_delay_s"] == 0.4
     assert keys["zoomed_speeds"] == [[1.5, 17.2], [4.0, 5.7]]  # 0.3 and 0.1 rad/s
     assert keys["lens"][0] == [0.0, 1.0]
     assert keys["lens"][-1] == [1.0, 8.0]

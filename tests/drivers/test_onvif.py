@@ -128,6 +128,13 @@ def test_a_head_that_another_program_moves_is_reported_once_and_left_alone(caplo
         assert unit.moves[: len(sent) + 1] == [*sent, "AbsoluteMove"]
 
 
+def test_a_steered_dome_that_stops_late_comes_to_rest_at_its_goal():
+    with OnvifUnit("continuous-only", "slow-stop") as unit, opened(unit, stop_delay_s=0.4) as dome:
+        dome.head.move(math.radians(20.0), math.radians(10.0), wait=True)
+        wait_for(lambda: not (dome.head.state().moving or unit.turning()))
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((20.0, 10.0), abs=unit.settings.slack_deg)
+
+
 def test_a_speed_is_a_share_of_the_highest():
     with OnvifUnit() as unit, opened(unit) as dome:
         begin = time.monotonic()

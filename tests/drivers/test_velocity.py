@@ -46,13 +46,29 @@ def test_an_axis_that_was_halted_stays_where_it_says_it_is():
     assert axis.arrives <= 1.0
 
 
-def steered(goals, seconds, late=0.05, start=0.0):
-    """Positions of an axis that turns at the velocities it gets, ``DELAY_S`` later, and is asked 20 times a second."""
-    axis, position, sent, places = SteeredAxis(FACTS, DELAY_S), start, [], []
+def steered(goals, seconds, late=0.05, start=0.0, stops_late=0.0, known=0.0, slowest=0.0):
+    """Positions of an axis that turns at the velocities it gets, ``DELAY_S`` later, and is asked 20 times a second.
+
+    Args:
+        goals: goal at a time, or None.
+        seconds: duration.
+        late: age of reported positions.
+        start: position.
+        stops_late: time for which it goes on after a stop, if no other velocity comes meanwhile.
+        known: that time, as the axis is told.
+        slowest: its lowest speed.
+    """
+    axis, position, sent, places = SteeredAxis(FACTS, DELAY_S, known), start, [], []
     history = [(-1.0, start)]
     for i in range(round(seconds * 100)):
         now = i / 100
-        velocity = next((v for t, v in reversed(sent) if t <= now - DELAY_S), 0.0)
+        known_to_it = [(t + DELAY_S, v) for t, v in sent if t <= now - DELAY_S]
+        changes = [(t, v) for i, (t, v) in enumerate(known_to_it) if i == 0 or v != known_to_it[i - 1][1]]
+        while changes and changes[-1][1] == 0 and changes[-1][0] > now - stops_late:
+            changes.pop()
+        velocity = changes[-1][1] if changes else 0.0
+        if velocity:
+            velocity = math.copysign(max(abs(velocity), slowest), velocity)
         position += velocity / 100
         history.append((now, position))
         if i % 10 == 0 and (goal := goals(now)) is not None:
@@ -84,6 +100,18 @@ def test_an_axis_does_not_go_beyond_its_range_with_its_goals():
     places = steered(lambda now: min(40.0 * now, FACTS.highest), 5.0)
     assert max(places) <= FACTS.highest
     assert places[-1] == pytest.approx(FACTS.highest, abs=FACTS.slack)
+
+
+@pytest.mark.parametrize(("stops_late", "slowest", "off"), [(0.4, 0.0, 0.1), (1.1, 0.0, 0.1), (1.1, 1.5, 1.0)])
+def test_an_axis_that_turns_on_after_a_stop_comes_to_rest_at_its_goal(stops_late, slowest, off):
+    """Within the slack, or, by its lowest speed of 1.5/s, within less than the 1.65 that it goes on."""
+    places = steered(lambda now: 30.0, 20.0, stops_late=stops_late, known=stops_late, slowest=slowest)
+    assert max(places[-200:]) == min(places[-200:]) == pytest.approx(30.0, abs=off)
+
+
+def test_an_axis_of_which_nobody_knows_that_it_turns_on_comes_to_rest_too():
+    places = steered(lambda now: 30.0, 20.0, stops_late=0.4, slowest=1.5)
+    assert max(places[-200:]) == min(places[-200:]) == pytest.approx(30.0, abs=0.6)
 
 
 def test_a_goal_that_is_given_again_moves_no_more():
