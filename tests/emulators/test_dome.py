@@ -53,7 +53,7 @@ def test_a_person_is_followed_as_well_as_in_the_simulation(tmp_path):
     rows = []
     for seed in range(RUNS):
         with contextlib.suppress(StaleFrameError):
-            rows += follow.run(tmp_path, "visca", "ptzoptics", SECONDS, seed)
+            rows += follow.run(tmp_path, "visca", SECONDS, seed)
             print(json.dumps(rows[-1]))
             if rows[-1]["wire"] >= SHARE * rows[-1]["sim"]:
                 return

@@ -135,6 +135,12 @@ def test_only_the_sign_of_a_velocity_counts():
         wait_for(lambda: unit.pan.degrees() > 20.0, 1.5)
 
 
+def test_its_lowest_speed_is_1_5_degrees_a_second():
+    with dome("lowest-speed") as unit:
+        done(unit, "ContinuousMove", turned("Velocity", 0.001, 0))
+        wait_for(lambda: unit.pan.degrees() > 0.75, 1.0)
+
+
 @pytest.mark.parametrize(("profile", "late_s"), [("slow-stop", 0.4), ("slower-stop", 1.1)])
 def test_it_turns_on_after_a_stop(profile, late_s):
     with dome(profile) as unit:
