@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 
 import av
 import cv2
+import numpy as np
 
 from cotarget.emulators.authentication import Authenticator
 from cotarget.emulators.plant import Feed
@@ -107,6 +108,7 @@ def split_nals(data: bytes) -> tuple[bytes, ...]:
 
 
 ENDLESS = 1_000_000  # pictures in a group
+LONG_GROUP_S = 10.0
 CHECK_S = 0.1  # period with which waiting threads check for the end [s]
 
 
@@ -155,8 +157,9 @@ class Encoder(Closes):
                 continue
             last = picture.index
             shown = shown if "frozen" in self._faults and shown is not None else picture.image
-            image = half(shown) if "resolution" in self._faults else shown
+            image = self._turned(half(shown) if "resolution" in self._faults else shown)
             group = ENDLESS if "no-key" in self._faults else self._group
+            group = round(LONG_GROUP_S * self._rate_hz) if "long-groups" in self._faults else group
             if context is None or (context.width, context.height, context.gop_size) != (*image.shape[1::-1], group):
                 context = self._encoder(image.shape[1], image.shape[0], group)
             frame = av.VideoFrame.from_ndarray(image, format="bgr24").reformat(format="yuv420p")
@@ -165,6 +168,11 @@ class Encoder(Closes):
                 t = begin + packet.pts / TICKS_HZ
                 self._stream.publish(AccessUnit(count, t, split_nals(bytes(packet))))
                 count += 1
+
+    def _turned(self, image: Image) -> Image:
+        """Turn or mirror an image as a camera on a ceiling may."""
+        image = image[::-1, ::-1] if "upside-down" in self._faults else image
+        return np.ascontiguousarray(image[:, ::-1] if "mirrored" in self._faults else image)
 
     def _encoder(self, width: int, height: int, group: int) -> av.CodecContext:
         context = av.CodecContext.create("libx264", "w")
@@ -256,6 +264,9 @@ RTSP_FAULTS = (
     "cut",  # the connection closes in the middle of a picture
     "corrupt",  # bytes of every picture are destroyed
     "no-key",  # one key frame, and then no more
+    "long-groups",  # a key frame every 10 s
+    "upside-down",  # the picture is turned by half a turn
+    "mirrored",  # left and right of the picture are exchanged
     "frozen",  # the same image is sent at its rate
     "resolution",  # half the size
     "unauthorized",  # 401 for any password

@@ -374,6 +374,36 @@ def test_a_frozen_picture_is_reported(caplog):
 
 
 @wire
+@pytest.mark.parametrize(("fault", "turned"), [("upside-down", np.s_[::-1, ::-1]), ("mirrored", np.s_[:, ::-1])])
+def test_a_picture_is_turned_as_on_a_ceiling(fault, turned):
+    image = np.zeros((*SIZE[::-1], 3), np.uint8)
+    image[:60, :80] = 200
+    faults = Faults(RTSP_FAULTS)
+    faults.set(fault)
+    with (
+        Film(lambda index: image, 1 / RATE_HZ) as film,
+        contextlib.closing(Encoder(film.feed, stream := EncodedStream(), RATE_HZ, faults=faults)),
+        RtspServer(stream) as server,
+        opened(server) as camera,
+    ):
+        assert np.abs(camera.read(timeout=PATIENCE_S).image.astype(float) - image[turned]).mean() < 2.0  # of 200
+
+
+@wire
+def test_long_groups_have_a_key_frame_every_10_s():
+    faults = Faults(RTSP_FAULTS)
+    faults.set("long-groups")
+    with (
+        Film(draw, 1 / RATE_HZ) as film,
+        contextlib.closing(Encoder(film.feed, stream := EncodedStream(), RATE_HZ, faults=faults)),
+    ):
+        units = [stream.after(-1, PATIENCE_S)]
+        while len(units) < 2 * RATE_HZ:
+            units.append(stream.after(units[-1].index, PATIENCE_S))
+    assert sum(unit.is_key for unit in units) <= 1
+
+
+@wire
 def test_another_size_is_named():
     with filmed() as server, opened(server) as camera:
         t = camera.read(timeout=PATIENCE_S).t
