@@ -162,8 +162,8 @@ class Status(NamedTuple):
     space: str = ""  # of pan and tilt
 
 
-def abilities_of(root: Element) -> Abilities:
-    """Read an answer to GetConfigurationOptions."""
+def abilities_of(root: Element | None) -> Abilities:
+    """Read an answer to GetConfigurationOptions; none without one."""
     options = find(root, "Body/GetConfigurationOptionsResponse/PTZConfigurationOptions")
     shortest, longest = (seconds(text_at(options, f"PTZTimeout/{name}")) for name in ("Min", "Max"))
     return Abilities(spaces_of(find(options, "Spaces")), Range(shortest, longest))
@@ -294,7 +294,7 @@ class OnvifDevice:
             media, self._ptz = self._services()
             self.profile, self.configuration = self._find_profile(media)
             token = f"<ConfigurationToken>{self.configuration.get('token', '')}</ConfigurationToken>"
-            found = abilities_of(self._ask(self._ptz, PTZ, "GetConfigurationOptions", token))
+            found = abilities_of(self._ask_if_able(self._ptz, PTZ, "GetConfigurationOptions", token))
             self.abilities = replace(found, spaces=self._node_spaces() | dict(found.spaces))
             self.url = settings.url or self._stream_address(media)
             opened.pop_all()
@@ -327,6 +327,15 @@ class OnvifDevice:
 
     def _ask(self, path: str, namespace: str, message: str, inner: str = "", timeout: float = ASK_S) -> Element:
         return self.soap.call(path, namespace, message, inner, timeout)
+
+    def _ask_if_able(self, path: str, namespace: str, message: str, inner: str = "") -> Element | None:
+        """Ask what some devices cannot answer; None for a fault that is not about the user."""
+        try:
+            return self._ask(path, namespace, message, inner)
+        except LoginFaultError:
+            raise
+        except FaultError:
+            return None
 
     def _connect(self, settings: OnvifSettings, password: str) -> SoapClient:
         """Find the port where the device answers; the time can be asked for without a user on most devices."""
@@ -368,24 +377,14 @@ class OnvifDevice:
 
     def _capabilities(self) -> dict[str, str]:
         """Return the addresses of services by GetCapabilities, which some devices lack."""
-        try:
-            root = self._ask(DEVICE_PATH, DEVICE, "GetCapabilities", "<Category>All</Category>")
-        except LoginFaultError:
-            raise
-        except FaultError:
-            return {}
+        root = self._ask_if_able(DEVICE_PATH, DEVICE, "GetCapabilities", "<Category>All</Category>")
         found = find(root, "Body/GetCapabilitiesResponse/Capabilities")
         said = {MEDIA: text_at(found, "Media/XAddr"), PTZ: text_at(found, "PTZ/XAddr")}
         return {namespace: address for namespace, address in said.items() if address}
 
     def _listed_services(self) -> dict[str, str]:
         """Return the addresses of services by GetServices, which older devices lack."""
-        try:
-            root = self._ask(DEVICE_PATH, DEVICE, "GetServices", "<IncludeCapability>false</IncludeCapability>")
-        except LoginFaultError:
-            raise
-        except FaultError:
-            return {}
+        root = self._ask_if_able(DEVICE_PATH, DEVICE, "GetServices", "<IncludeCapability>false</IncludeCapability>")
         known = find_all(root, "Body/GetServicesResponse/Service")
         return {text_at(each, "Namespace"): text_at(each, "XAddr") for each in known}
 
@@ -415,12 +414,7 @@ class OnvifDevice:
 
     def _node_spaces(self) -> dict[str, tuple[Space, ...]]:
         """Return the coordinate systems of the configuration's node, which has those that some configurations lack."""
-        try:
-            nodes = find_all(self._ask(self._ptz, PTZ, "GetNodes"), "Body/GetNodesResponse/PTZNode")
-        except LoginFaultError:
-            raise
-        except FaultError:
-            return {}
+        nodes = find_all(self._ask_if_able(self._ptz, PTZ, "GetNodes"), "Body/GetNodesResponse/PTZNode")
         wanted = text_at(self.configuration, "NodeToken")
         node = next((node for node in nodes if node.get("token") == wanted), None)
         return spaces_of(find(node, "SupportedPTZSpaces"))

@@ -135,6 +135,16 @@ def test_a_steered_dome_that_stops_late_comes_to_rest_at_its_goal():
         assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((20.0, 10.0), abs=unit.settings.slack_deg)
 
 
+def test_a_device_without_options_is_known_by_its_node(monkeypatch):
+    def unable(*about):
+        raise SoapFault("Optional action not implemented", "ActionNotSupported", code="Receiver")
+
+    monkeypatch.setitem(ANSWERS, (TPTZ, "GetConfigurationOptions"), unable)
+    with OnvifUnit() as unit, opened(unit) as dome:
+        dome.head.move(math.radians(5.0), 0.0, wait=True)
+        assert unit.pan.degrees() == pytest.approx(5.0, abs=NEAR_DEG)
+
+
 def test_a_speed_is_a_share_of_the_highest():
     with OnvifUnit() as unit, opened(unit) as dome:
         begin = time.monotonic()
