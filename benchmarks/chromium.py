@@ -123,14 +123,12 @@ class Browser:
         for kind in ("mousePressed", "mouseReleased"):
             self.mouse(kind, x_y, button="left", clickCount=1)
 
-    def key(self, key: str, *kinds: str, code: str | None = None, text: str | None = None) -> None:
-        """Press and release a key, or only one of both."""
+    def key(self, key: str, *kinds: str, code: str | None = None, text: str | None = None, modifiers: int = 0) -> None:
+        """Press and release a key, or only one of both; modifiers are Alt 1, Ctrl 2, Meta 4 and Shift 8."""
         for kind in kinds or ("keyDown", "keyUp"):
-            more = {"text": text} if text and kind == "keyDown" else {}
-            number = KEY_CODES.get(key, ord(key[0].upper()))
-            self.call(
-                "Input.dispatchKeyEvent", type=kind, key=key, code=code or key, windowsVirtualKeyCode=number, **more
-            )
+            more: dict[str, Any] = {"text": text} if text and kind == "keyDown" else {}
+            more |= {"code": code or key, "windowsVirtualKeyCode": KEY_CODES.get(key, ord(key[0].upper()))}
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **more)
 
     def touch(self, kind: str, *points: Point) -> None:
         """Touch the screen."""

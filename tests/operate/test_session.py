@@ -268,6 +268,8 @@ def stop_and_clear(i, session, wall, rig):
     if i == 40:
         with pytest.raises(ConfigError, match="Clear"):
             session.follow("head")
+        with pytest.raises(ConfigError, match="Clear"):
+            session.record(True)
         session.manual("head", (1.0, 0.0))
     if i == 50:
         session.clear()
@@ -347,13 +349,16 @@ def test_another_program_clears_a_stop_and_then_the_head_stands(path, tmp_path, 
             assert clear_stop_file(file) == "a hand in the gears"
         if i == 40:  # the next stop is another one
             session.stop("once more")
-        if i == 50:
+        if i in (50, 55):
             session.clear()
+        if i == 51:  # that its file is not there yet is no Clear
+            session.stop("again")
+            file.unlink()
         said[i] = session.stopped
 
     guard_file = file if real_time else None
     steps = operate(path, 70, act, stop_file=file, guard_file=guard_file, devices=ToyDevices(real_time=real_time))
-    assert [said[i] for i in (29, 32, 49, 52)] == ["a hand in the gears", None, "once more", None]
+    assert [said[i] for i in (29, 32, 49, 54, 57)] == ["a hand in the gears", None, "once more", "again", None]
     assert {step.state for step in steps[21:61]} == {State.STANDING}
     assert steps[-1].state in FOLLOWED
 

@@ -23,6 +23,7 @@ pytestmark = [
 ]
 STOP = ("stop", "stopped from the page")
 TRACK = SimpleNamespace(id=7, center_px=np.array([100.0, 60.0]), size_px=np.array([40.0, 30.0]), reported=True)
+SHIFT = 8  # modifier of a key
 PLACE_PX = 2.0  # of a click, by the rounding of the layout
 TEXT, LARGE = 4.5, 3.0  # contrast of WCAG AA: of text, of large text and of what surrounds controls
 
@@ -112,6 +113,22 @@ def test_every_control_is_reached_by_tab(browser, at):
         browser.key("Tab")
         seen.add(browser.js("document.activeElement.id || document.activeElement.textContent"))
     assert {"stop", "follow", "stand", "home", "Follow 7"} <= seen
+
+
+def test_what_gets_the_focus_is_not_behind_the_header(browser, at):
+    until(lambda: not browser.js("document.getElementById('home').disabled"))
+    browser.size(800, 420)
+    try:
+        browser.js("scrollTo(0, 99999); document.querySelector('summary').focus()")
+        for _ in range(10):
+            browser.key("Tab", modifiers=SHIFT)
+            edges = browser.js(
+                "['header', ':focus'].map((each) => document.querySelector(each).getBoundingClientRect()).map("
+                "(box, i) => (i ? box.top : box.bottom))"
+            )
+            assert browser.js("document.activeElement.id") == "stop" or edges[1] >= edges[0]
+    finally:
+        browser.size(1200, 900)
 
 
 def test_arrow_keys_turn_while_they_are_held(browser, at):
