@@ -14,7 +14,7 @@ import numpy as np
 
 from cotarget.config import FollowConfig
 from cotarget.control.orders import MANUAL_S, Order
-from cotarget.errors import ConfigError, CotargetError
+from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.pipeline import HEAD, Mode, Run, State, Step
 from cotarget.rig import Rig
 from cotarget.safety.stop_file import StopLook, clear_stop_file, write_stop_file
@@ -161,8 +161,11 @@ class Session:
             self._orders, self._turning, self._zooms = [Order("stop", reason=reason)], {}, []
         if self._rig.spec.real_time:  # a simulation's devices are the run's thread's alone
             self._rig.stop(reason)
-        if self._stop_file is not None:
-            write_stop_file(self._stop_file, reason)
+        try:
+            if self._stop_file is not None:
+                write_stop_file(self._stop_file, reason)
+        except DeviceError as error:
+            raise DeviceError(f"this run is stopped, but no other program is, nor the next run: {error}") from None
 
     def clear(self, *, by: str | None = None) -> None:
         """End the stop before the next frame; all heads stand then."""

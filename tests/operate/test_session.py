@@ -368,7 +368,7 @@ def test_a_stop_without_its_file_lasts(path, tmp_path):
 
     def act(i, session, wall, rig):
         if i == 10:
-            with pytest.raises(DeviceError, match="NOT stopped"):
+            with pytest.raises(DeviceError, match=r"this run is stopped.*NOT stopped"):
                 session.stop("the disk is gone")
 
     steps = operate(path, 20, act, stop_file=tmp_path / "gone" / "rig.stop")
