@@ -284,7 +284,7 @@ def test_a_stop_is_counted_by_nobody(at):
 
 def test_a_stop_waits_for_no_picture(at, monkeypatch):
     packing, leave = threading.Event(), threading.Event()
-    monkeypatch.setattr(server, "pack", lambda *_: packing.set() or leave.wait(DEADLINE_S) or b"")
+    monkeypatch.setattr(server, "pack", lambda *_: packing.set() or leave.wait(2 * DEADLINE_S) or b"")
     with browser(at) as mine:
         at.page.show(step(), SPEC)
         assert packing.wait(DEADLINE_S)
@@ -301,7 +301,7 @@ def test_a_stop_that_takes_long_delays_nobody_else():
     class Slow(NotingSession):
         def stop(self, reason):
             super().stop(reason)
-            leave.wait(DEADLINE_S)
+            leave.wait(2 * DEADLINE_S)
 
     with served(Slow()) as slow, browser(slow) as mine, browser(slow, who="b") as other:
         say(mine, do="stop")
