@@ -21,6 +21,7 @@ FLAGS = (
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--mute-audio",
 )  # fmt: skip
 KEY_CODES = {" ": 32, "Enter": 13, "Tab": 9, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40}
+NAVIGATED = "Inspected target navigated or closed"  # of the protocol's error
 Found = TypeVar("Found")
 Point = Sequence[float]
 
@@ -28,6 +29,10 @@ Point = Sequence[float]
 def find() -> str | None:
     """Find the path of Chromium; None where it is not installed."""
     return next(filter(None, map(shutil.which, NAMES)), None)
+
+
+class NavigatedError(AssertionError):
+    """The page was left before it had answered."""
 
 
 class Browser:
@@ -84,6 +89,8 @@ class Browser:
         while True:
             answer: dict[str, Any] = json.loads(self._socket.recv(DEADLINE_S))
             if answer.get("id") == number:
+                if NAVIGATED in str(answer.get("error")):
+                    raise NavigatedError(answer)
                 assert "error" not in answer, answer
                 result: dict[str, Any] = answer["result"]
                 return result
@@ -100,8 +107,11 @@ class Browser:
         return answer["result"].get("value")
 
     def text(self, name: str) -> str:
-        """Return the text of an element; empty where the page has none yet."""
-        found: str = self.js(f"document.getElementById('{name}')?.textContent ?? ''")
+        """Return the text of an element; empty where the page has none yet, or is left meanwhile."""
+        try:
+            found: str = self.js(f"document.getElementById('{name}')?.textContent ?? ''")
+        except NavigatedError:
+            return ""
         return found
 
     def center(self, name: str, at: Point = (0.5, 0.5)) -> Point:

@@ -1,5 +1,6 @@
 """The page in headless Chromium: pictures, mouse, touch, keys, and what it says without a connection."""
 
+import colorsys
 import re
 import threading
 import time
@@ -380,6 +381,22 @@ def test_colours_have_enough_contrast(dark):
     assert contrast(c["on-stop"], c["stop"]) >= TEXT
     for edge in ("line", "act", "stop"):
         assert contrast(c[edge], c["paper"]) >= LARGE, edge
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_stop_alone_is_red_and_no_control_is_yellow_or_green(dark):
+    """IEC 60204-1: hold-to-run controls are none of these, and Stop is no emergency stop, which is red on yellow."""
+    c = colours(dark)
+    hues = {name: hue_deg(c[name]) for name in ("stop", "on-stop", "act", "on-act", "raised", "ink")}
+    assert hues.pop("stop") > 330
+    assert {name: hue for name, hue in hues.items() if hue is not None and not 180 < hue < 270} == {}
+    assert "emergency" not in render("page.html").lower()
+
+
+def hue_deg(colour):
+    """The hue of a colour [degrees]: red is 0, yellow 60, green 120, blue 240; None of black and white."""
+    hue, saturation, _ = colorsys.rgb_to_hsv(*(int(colour[i : i + 2], 16) for i in (1, 3, 5)))
+    return 360 * hue if saturation else None
 
 
 def test_nothing_moves_on_the_page_by_itself():
