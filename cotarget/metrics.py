@@ -6,6 +6,7 @@ and the simulation's truth. Scores use rows alone, so every figure can be recomp
 
 import csv
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass
@@ -278,8 +279,7 @@ class Score:
 
 def score(rows: Sequence[Row]) -> Score:
     """Score one run that follows one target; the fields of `Score` hold the definitions."""
-    learnt_s = rows[0].t_s + BACKGROUND_S - ROUNDING_S if rows else 0.0
-    start = next((i for i, row in enumerate(rows) if row.in_wide and row.t_s >= learnt_s), None)
+    start = _start(rows)
     if start is None:
         return Score(0, *[None] * 11)
     counted = rows[start:]
@@ -313,6 +313,28 @@ def score(rows: Sequence[Row]) -> Score:
         id_switches_per_min=_per_minute(id_switches(map(_on, counted)), counted),
         centred_yield=float(np.mean([closeup.centred for closeup in shown])) if shown else None,
     )
+
+
+def out_of_frame_s(rows: Sequence[Row]) -> float:
+    """Sum up how long a target was out of frame after its acquisition while nothing hid it [s]; inf if never acquired.
+
+    Args:
+        rows: rows of one run.
+    """
+    start = _start(rows)
+    acquired = None if start is None else _acquired(rows[start:])
+    if start is None or acquired is None:
+        return math.inf
+    after = rows[start + acquired :]
+    return sum(
+        row.t_s - before.t_s for before, row in itertools.pairwise(after) if not (row.hidden or row.closeup.in_frame)
+    )
+
+
+def _start(rows: Sequence[Row]) -> int | None:
+    """Index of the first row that counts; None if there is none."""
+    learnt_s = rows[0].t_s + BACKGROUND_S - ROUNDING_S if rows else 0.0
+    return next((i for i, row in enumerate(rows) if row.in_wide and row.t_s >= learnt_s), None)
 
 
 def _acquired(rows: Sequence[Row]) -> int | None:

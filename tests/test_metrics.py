@@ -6,7 +6,7 @@ import math
 import pytest
 
 from cotarget.errors import ConfigError
-from cotarget.metrics import Row, Score, read_rows, score, write_rows
+from cotarget.metrics import Row, Score, out_of_frame_s, read_rows, score, write_rows
 
 PERIOD = 0.04
 EXACT = 1e-9
@@ -52,6 +52,13 @@ def test_counting_starts_with_the_target_wholly_in_the_fixed_view_after_2_s():
     assert gone_again.frames == 50
     rows = [dataclasses.replace(row, t_s=1000.0 + row.t_s) for row in run((120, {}))]
     assert score(rows).frames == 70  # the clock may begin anywhere
+
+
+def test_time_out_of_frame_counts_after_acquisition_and_while_nothing_hides_the_target():
+    """Ten rows before the acquisition and five hidden ones do not count; twenty of 0.04 s do."""
+    rows = run((60, AWAY), (30, {}), (5, AWAY | {"hidden": True}), (20, AWAY), (10, {}))
+    assert out_of_frame_s(rows) == pytest.approx(20 * PERIOD, abs=EXACT)
+    assert out_of_frame_s(run((100, AWAY))) == math.inf
 
 
 def test_acquisition_is_at_the_start_of_the_first_half_second_in_frame():

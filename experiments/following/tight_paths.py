@@ -48,7 +48,8 @@ class Style:
         stops: part of the legs at whose end it stands for a while.
         soften_s: time over which turns and stops are spread [s].
         gust: rms acceleration of gusts [m/s^2].
-        half: half of the size that has to be in view [m].
+        half: half of the size that has to be in view, and that the wall is higher [m].
+        half_width: half of the width that the wall hides [m].
     """
 
     depths: tuple[float, float]
@@ -59,12 +60,13 @@ class Style:
     soften_s: float
     gust: float
     half: float
+    half_width: float
 
 
 STYLES = {
-    "book": Style((12.0, 5.0), (1.4, 2.0), (0.5, 1.0, 2.0), (0.6, 1.6), 0.5, 0.15, 0.0, 0.14),
-    "person": Style((30.0, 16.0), (PERSON_HEIGHT / 2,) * 2, (1.5, 3.0, 5.0, 6.0), (0.8, 2.2), 0.3, 0.25, 0.0, 0.9),
-    "bird": Style((80.0, 6.0), (0.2, 0.32), (3.0, 6.0, 9.0), (1.0, 2.5), 0.0, 0.4, 3.0, 0.5),
+    "book": Style((12.0, 5.0), (1.4, 2.0), (0.5, 1.0, 2.0), (0.6, 1.6), 0.5, 0.15, 0.0, 0.14, 0.14),
+    "person": Style((30.0, 16.0), (PERSON_HEIGHT / 2,) * 2, (1.5, 3.0, 5.0, 6.0), (0.8, 2.2), 0.3, 0.25, 0.0, 0.9, 0.9),
+    "bird": Style((80.0, 6.0), (0.2, 0.32), (3.0, 6.0, 9.0), (1.0, 2.5), 0.0, 0.4, 3.0, 0.5, 0.5),
 }
 STAND_S = (0.6, 1.2)  # duration of a stop [s]
 GUST_S = 0.4  # correlation time of gusts [s]
@@ -100,23 +102,51 @@ class Course:
     wall: Wall
 
 
-def tight_course(name: str, seed: int, seconds: float) -> Course:
-    """Draw the course of a book, person or bird for a run of some seconds."""
-    rng, style, size = np.random.default_rng((seed, COURSES, *name.encode())), STYLES[name], true_size(name, seed)
-    t = np.arange(BEGIN, seconds + AFTER + STEP_S / 2, STEP_S)
+def tight_course(name: str, seed: int, seconds: float, style: Style | None = None) -> Course:
+    """Draw the course of a book, person or bird for a run of some seconds, by default in its own style."""
+    rng, style = _rng(name, seed), style or STYLES[name]
+    for t, x in _drawn_paths(rng, name, seed, seconds, style):
+        counted = _counted(t, seconds)
+        walls = (_wall(rng, style, t[counted], x[counted]) for _ in range(PLACES))
+        wall = next((each for each in walls if each is not None), None)
+        if wall is not None:
+            return Course(_waypoints(t, x), wall)
+    raise RuntimeError(f"no course of a {name} was drawn in {TRIES} tries; the ranges above do not fit together")
+
+
+def open_path(name: str, seed: int, seconds: float, style: Style) -> tuple[Waypoint, ...]:
+    """Draw the path of a target in a style, for a run of some seconds without a wall."""
+    for t, x in _drawn_paths(_rng(name, seed), name, seed, seconds, style):
+        return _waypoints(t, x)
+    raise RuntimeError(f"no path of a {name} was drawn in {TRIES} tries; the style's ranges do not fit together")
+
+
+def _rng(name: str, seed: int) -> np.random.Generator:
+    return np.random.default_rng((seed, COURSES, *name.encode()))
+
+
+def _counted(t: Array, seconds: float) -> npt.NDArray[np.bool_]:
+    """Tell the times at which a target has to be in view."""
+    return np.asarray((t >= ENTERED_S) & (t <= seconds))
+
+
+def _waypoints(t: Array, x: Array) -> tuple[Waypoint, ...]:
+    knots = zip(t[::KNOTS], x[::KNOTS], strict=True)
+    return tuple((float(a), *map(float, b)) for a, b in knots)  # type: ignore[misc]
+
+
+def _drawn_paths(
+    rng: np.random.Generator, name: str, seed: int, seconds: float, style: Style
+) -> Iterator[tuple[Array, Array]]:
+    """Draw times (n,) and positions (n, 3) of a target that stays in view and that the head can follow."""
+    size, t = true_size(name, seed), np.arange(BEGIN, seconds + AFTER + STEP_S / 2, STEP_S)
     for _ in range(TRIES):
         x = _drawn(rng, style, t, enters=name == "person")
         if name == "person":
             x[:, 2] *= size
-        counted = (t >= ENTERED_S) & (t <= seconds)
-        if not (in_view(x[counted], style.half).all() and _can_be_followed(x[counted])):
-            continue
-        walls = (_wall(rng, style, t[counted], x[counted]) for _ in range(PLACES))
-        wall = next((each for each in walls if each is not None), None)
-        if wall is not None:
-            knots = zip(t[::KNOTS], x[::KNOTS], strict=True)
-            return Course(tuple((float(a), *map(float, b)) for a, b in knots), wall)  # type: ignore[misc]
-    raise RuntimeError(f"no course of a {name} was drawn in {TRIES} tries; the ranges above do not fit together")
+        counted = _counted(t, seconds)
+        if in_view(x[counted], style.half).all() and _can_be_followed(x[counted]):
+            yield t, x
 
 
 def _drawn(rng: np.random.Generator, style: Style, t: Array, enters: bool) -> Array:
@@ -180,7 +210,7 @@ def _wall(rng: np.random.Generator, style: Style, t: Array, x: Array) -> Wall | 
     behind = (t >= begin) & (t <= begin + HIDDEN_S)
     (pan, tilt), distance = _angles(x), np.hypot(*(x - MOUNT)[:, :2].T)
     least = float(distance[behind].min())
-    margin = style.half / least
+    margin = style.half_width / least
     low, high = float(pan[behind].min()), float(pan[behind].max())
     hidden: npt.NDArray[np.bool_] = (pan > low + margin) & (pan < high - margin) & (distance > WALL_AT * least)
     touched = (pan > low - margin) & (pan < high + margin) & (distance > WALL_AT * least)
@@ -188,5 +218,5 @@ def _wall(rng: np.random.Generator, style: Style, t: Array, x: Array) -> Wall | 
     if hidden_s < LEAST_HIDDEN_S or touched_s > MOST_TOUCHED_S:
         return None
     middle, away = (low + high) / 2, WALL_AT * least
-    top = MOUNT[2] + away * math.tan(float(tilt[behind].max()) + margin)
+    top = MOUNT[2] + away * math.tan(float(tilt[behind].max()) + style.half / least)
     return Wall(away * math.sin(middle), away * math.cos(middle), 2 * away * math.tan((high - low) / 2), top, -middle)
