@@ -27,6 +27,7 @@ from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image, PanTiltState, ZoomState
 from cotarget.targets import Target
 from cotarget.tracking.track import BEAT_S, LARGEST_AREA_RATIO, SizeHistory, Track, missing, room_inside
+from cotarget.tracking.tracker import Expected
 
 REMEMBERED_S = 2.0  # longer than any latency [s]
 # States for the cubic interpolation: two before a time and two after it. A straight line through the nearest two is
@@ -369,6 +370,12 @@ class TargetFusion:
         # Clouds and foliage move the measured shift by a standard deviation of about a step of the head.
         if math.dist(turned.turn, self.camera.turn) > math.sqrt(GATE) * HEAD_SIGMA:
             self.camera = turned
+
+    def expected(self, target: Target | None, t: float) -> Expected:
+        """Predict a target in the fixed image at time t [s], by the id of its track; see `Estimate.in_fixed`."""
+        estimate = None if target is None else target.estimate(t)
+        found = None if estimate is None else estimate.in_fixed(self.camera)
+        return {} if target is None or found is None else {target.id: found}
 
     def warnings(self) -> list[str]:
         """Describe how the fixed camera has been moved since the first frame, a sentence each."""

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Real
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -56,7 +57,7 @@ from cotarget.rig import (
 from cotarget.targeting import Aim, target_implausibility
 from cotarget.targets import Target
 from cotarget.tracking.track import Track, TrackingSettings, tracking_settings
-from cotarget.tracking.tracker import Tracker
+from cotarget.tracking.tracker import Expected, Tracker
 
 # Longest wait for a zoom frame, except for the first, and pause after a fixed frame that repeats or jumps in time [s].
 WAIT_S = 2e-3
@@ -229,15 +230,20 @@ class CameraRun:
         self._detector, self._tracker, self.ignored = detector, tracker, ignored
         self.tracks: list[Track] = []
 
-    def track(self, frame: Frame) -> Detections:
-        """Detect the targets of a frame, given the tracks after the last one, and update the tracks."""
+    def track(self, frame: Frame, expected: Expected = MappingProxyType({})) -> Detections:
+        """Detect the targets of a frame, given the tracks after the last one, and update the tracks.
+
+        Args:
+            frame: frame of the camera.
+            expected: where tracks are expected in it.
+        """
         if self.ignored:
             image = frame.image.copy()
             for each in self.ignored:  # in one call, what two share would stay
                 cv2.fillPoly(image, [outline_px(each, image)], MID_GREY)
             frame = replace(frame, image=image)
         found = self._detector.detect(frame, self.tracks)
-        self.tracks = self._tracker.update(found.boxes, frame.t, found.shift, cut=found.cut)
+        self.tracks = self._tracker.update(found.boxes, frame.t, found.shift, cut=found.cut, expected=expected)
         return found
 
 
@@ -694,7 +700,8 @@ class Run:
         frames, head = self._frames, self.head
         shown = frames.read_fixed()
         frame = replace(shown, t=shown.t - head.search.correct_clock())
-        detections, tracks = self.camera.track(frame), self.camera.tracks
+        detections = self.camera.track(frame, self.fusion.expected(head.search.target, frame.t))
+        tracks = self.camera.tracks
         favoured = {track.id for track in tracks if head.selector.favours(track)}
         self.fusion.add_shift(detections.shift, cut=detections.cut)
         self.fusion.add_tracks(frame, tracks, detections.mask, [head.search], favoured)

@@ -41,7 +41,7 @@ class FixedCamera:
 
     def project(self, x_fixed: Array) -> Array:
         """Project points (..., 3) [m] into the image, (..., 2) [px]; see `Intrinsics.project`."""
-        return self.lens.project(x_fixed)
+        return self.lens.project(x_fixed @ self._turned if self.turn != (0.0, 0.0) else x_fixed)
 
     def resized(self, size: tuple[int, int]) -> "FixedCamera":
         """Return the same camera for a stream scaled to another size (width, height) [px]."""
@@ -58,10 +58,15 @@ class FixedCamera:
         if found is None or self.turn == (0.0, 0.0):
             return found
         (x, y), J = found
-        R = Rotation.from_rotvec([*self.turn, 0.0]).as_matrix()
+        R = self._turned
         ray = R @ (x, y, 1.0)
         tangent = ray[:2] / ray[2]
         return tangent, (R[:2, :2] - np.outer(tangent, R[2, :2])) / ray[2] @ J
+
+    @cached_property
+    def _turned(self) -> Array:
+        """Rotation from the turned camera's frame to the frame "fixed", (3, 3)."""
+        return np.asarray(Rotation.from_rotvec([*self.turn, 0.0]).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)

@@ -195,10 +195,12 @@ def _eligible(candidates: Sequence[Candidate]) -> Sequence[Candidate]:
     """Filter candidates to those that the head can reach and that are likely targets.
 
     If none can be reached, all stay, so that the run can report why. If none is likely, all reachable ones stay, since
-    nominal size or calibration may be wrong. An unlikely one is for example a cloud taken for a person.
+    nominal size or calibration may be wrong. An unlikely one is for example a cloud taken for a person. One that has
+    been hidden for long is waited for while no other is in sight.
     """
     reachable = [candidate for candidate in candidates if candidate.reachable] or candidates
-    return [candidate for candidate in reachable if candidate.likely] or reachable
+    likely = [candidate for candidate in reachable if candidate.likely] or reachable
+    return [candidate for candidate in likely if not candidate.track.hidden] or likely
 
 
 @dataclass
@@ -357,7 +359,8 @@ class Chosen:
         if self._found is None:
             self._found = self.number if self.pixel is None else self._clicked(candidates)
         there = {candidate.id: candidate for candidate in candidates}
-        if self._found not in there and (back := [c.track for c in candidates if self._is_back(c.track)]):
+        gone = self._found not in there or there[self._found].track.hidden
+        if gone and (back := [c.track for c in candidates if self._is_back(c.track)]):
             self._found = min(back, key=lambda track: (self._off_course(track), track.id)).id
         self._there = self._found in there
         if self._found is None or not self._there:

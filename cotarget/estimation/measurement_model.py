@@ -19,15 +19,19 @@ from cotarget.estimation.motion_model import (
     OF_SIZE,
     PAN,
     SEEN,
+    STATES,
     TAN_X,
     TAN_Y,
     TILT,
+    VEL_X,
+    VEL_Y,
     VEL_Z,
     VELOCITY,
     MotionSettings,
 )
 from cotarget.geometry import Array
 from cotarget.pantilt import HeadGeometry
+from cotarget.rig_geometry import FixedCamera
 from cotarget.targeting import WantedSize
 
 
@@ -239,6 +243,27 @@ class Estimate:
         """Wanted size of the target for `aim`, from its present apparent size, foreshortened or not."""
         apparent = self.target.size * math.exp(self.state[LOG_SIZE] + self.state[LOG_APPARENT])
         return WantedSize(apparent, self.target.wanted_px, self.target.is_vertical())
+
+    def in_fixed(self, camera: FixedCamera) -> tuple[Array, Array] | None:
+        """Predict place and velocity in the fixed image.
+
+        Args:
+            camera: the fixed camera, as it is turned now.
+
+        Returns:
+            (u, v, du, dv), (4,) [px, px/s], and their covariance, (4, 4); None if no pixel shows the target.
+        """
+        x, pixel = self.state, camera.project(self.x_fixed)
+        found = camera.tangents(pixel)
+        if found is None:
+            return None
+        by_tangent = np.linalg.inv(found[1])
+        H = np.zeros((4, STATES))
+        H[[0, 1], [TAN_X, TAN_Y]] = H[[2, 3], [VEL_X, VEL_Y]] = 1.0
+        H[[2, 3], [TAN_X, TAN_Y]] = -x[VEL_Z]
+        H[[2, 3], VEL_Z] = -x[[TAN_X, TAN_Y]]
+        H = np.kron(np.eye(2), by_tangent) @ H
+        return np.concatenate([pixel, by_tangent @ rate(x)[:2]]), H @ self.state_covariance @ H.T
 
     def appearance(self, pan: float, tilt: float, nominal_px: float, shape: float = 1.0) -> Appearance | None:
         """Predict where and how large the target appears in the zoom image, head bias included.

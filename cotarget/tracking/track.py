@@ -373,6 +373,7 @@ class Track:
         box: the last detection.
         shared: whether that detection covers other tracks too, so that it only bounds this one's place.
         seen_t: time of that detection [s].
+        hidden: whether it is out of sight for longer than a track lives without an expected place.
     """
 
     id: int
@@ -388,6 +389,7 @@ class Track:
     box: Detection
     shared: bool = False
     seen_t: float = -math.inf
+    hidden: bool = False
 
     @property
     def reported(self) -> bool:
@@ -421,6 +423,7 @@ class LiveTrack:
         self.missed = 0
         self.confirmed = False
         self.after_cut = False  # whether the film was cut since the last detection
+        self.expected = False  # whether the place in this frame is known from elsewhere
         self._image_size = image_size
         self.mean_score = 0.0
         self._sizes = SizeHistory(settings.size_s, settings.trend)
@@ -458,6 +461,12 @@ class LiveTrack:
         for axis in self._axes:
             axis.predict(t - self.t, self.settings.process_noise)
         self.t = t
+
+    def expect(self, state: Array, covariance: Array) -> None:
+        """Take over a predicted (u, v, du, dv), (4,) [px, px/s], and its covariance, (4, 4)."""
+        for i, axis in enumerate(self._axes):
+            axis.position, axis.velocity = float(state[i]), float(state[i + 2])
+            axis.P = float(covariance[i, i]), float(covariance[i, i + 2]), float(covariance[i + 2, i + 2])
 
     def move(self, by: Array) -> None:
         """Move with the scene, by (du, dv) [px], because the camera has turned."""
@@ -509,7 +518,19 @@ class LiveTrack:
             (u, v), (width, height) = self.center, image_size
             if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
                 return True
+        return self.hidden and not self._may_come_out(image_size)
+
+    @property
+    def hidden(self) -> bool:
+        """Whether it has had no detection for longer than its timeout."""
         return self.t - self.believed > self.timeout_s
+
+    def _may_come_out(self, image_size: tuple[int, int] | None) -> bool:
+        """Whether a detection where the track is expected would rather be its target than a new object."""
+        if not self.expected or self.after_cut or image_size is None or self.t - self.seen > self.seen - self.born:
+            return False
+        limit = least_likely(self.settings, self.t - self.seen, image_size)
+        return bool(math.log(math.prod(self.center_variance)) < limit)
 
     def track(self) -> Track:
         """Give the state as a frozen `Track`."""
@@ -536,6 +557,7 @@ class LiveTrack:
             box=self.detection,
             shared=self.shared,
             seen_t=self.seen,
+            hidden=self.hidden,
         )
 
     def variance(self, detection: Detection) -> list[float]:
@@ -609,6 +631,25 @@ def missing(usual: Array, size: Array) -> Array:
 def room_inside(around: Array, size: Array) -> Array:
     """Largest distance of a target's centre from that of a larger box around it [px], (2,)."""
     return np.maximum(0.0, (around - size) / 2)
+
+
+def least_likely(
+    settings: TrackingSettings, hidden_s: Array | float, image_size: tuple[int, int], clutter: Array | float = 0.0
+) -> Array:
+    """Largest distance plus log volume at which a detection is a hidden target and no new object.
+
+    A target hidden for some time reappears at a rate of about once in that time, with a normal density; new objects
+    appear anywhere.
+
+    Args:
+        settings: rate of new objects.
+        hidden_s: time without a detection [s]; 0 for a target that is in sight, which has no limit.
+        image_size: (width, height) [px].
+        clutter: number of detections in the image that may be anything.
+    """
+    density = (settings.newcomers_hz * hidden_s + clutter) / math.prod(image_size)
+    with np.errstate(divide="ignore"):
+        return np.asarray(-2 * np.log(2 * math.pi * density))
 
 
 def center_variance(settings: TrackingSettings, size: Sides, part: Sides, lacks: Sides) -> Sides:

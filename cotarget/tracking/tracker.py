@@ -4,8 +4,8 @@ Detections are assigned to tracks by the Hungarian method, inside a gate on the 
 Each track is filtered by `cotarget.tracking.track`. The source of the numbers: docs/design-notes.md.
 """
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -19,6 +19,7 @@ from cotarget.tracking.track import (
     Track,
     TrackingSettings,
     center_variance,
+    least_likely,
     missing,
     tracking_settings,
 )
@@ -30,6 +31,9 @@ IMPOSSIBLE = 1e6
 PART, NEAR = 0.5, 1.5
 # A box around a track begins another one if its area is larger by this factor: it may be a flock around a bird.
 LARGER = 4.0
+
+# States (u, v, du, dv), (4,) [px, px/s], and their covariances, (4, 4), by the ids of tracks.
+Expected = Mapping[int, tuple[Array, Array]]
 
 
 class Tracker:
@@ -58,7 +62,13 @@ class Tracker:
         return sorted((s.track() for s in self._tracks), key=lambda track: (not track.confirmed, track.id))
 
     def update(
-        self, detections: Sequence[Detection], t: float, shift: Array | None = None, *, cut: bool = False
+        self,
+        detections: Sequence[Detection],
+        t: float,
+        shift: Array | None = None,
+        *,
+        cut: bool = False,
+        expected: Expected = MappingProxyType({}),
     ) -> list[Track]:
         """Update the tracks with one frame's detections.
 
@@ -70,6 +80,9 @@ class Tracker:
             shift: shift of the scene in the image since the first frame (du, dv) [px], (2,); None for a camera that
                 stands. Tracks move with the scene.
             cut: whether the frame shows another scene than the one before. Tracks that are not found again end soon.
+            expected: predictions at ``t`` by a better filter than the tracks' own. Out of sight, a confirmed track has
+                the predicted state. It lives for as long as a detection there would rather be its target than a new
+                object, at most for as long as it was seen.
 
         Returns:
             All tracks at ``t``; confirmed ones first, then by age.
@@ -78,7 +91,7 @@ class Tracker:
             if self._t - t <= self._settings.lose_s:
                 return self.tracks
             self._tracks.clear()
-        self._begin(t)
+        self._begin(t, expected)
         self._follow_scene(self._shift if shift is None else shift, cut)
         detections = self._most_useful(detections)
         matches: dict[int, int] = {}
@@ -100,15 +113,20 @@ class Tracker:
         self._start_tracks([each for j, each in enumerate(detections) if j not in taken and each.score >= least], t)
         return self.tracks
 
-    def _begin(self, t: float) -> None:
+    def _begin(self, t: float, expected: Expected) -> None:
         """Predict all tracks to a frame's time and end those that did not survive a gap between frames.
 
         The search area grows with the gap, until any detection would match. The time between the last two frames is no
         such gap, even for a track that lives no longer.
         """
-        self._tracks = [state for state in self._tracks if t - state.seen <= state.timeout_s + self._interval]
         for state in self._tracks:
             state.predict(t)
+            state.expected = bool(state.number in expected and state.missed and state.confirmed)
+            if state.expected:
+                state.expect(*expected[state.number])
+        self._tracks = [
+            state for state in self._tracks if state.expected or t - state.seen <= state.timeout_s + self._interval
+        ]
         if self._t is not None and t > self._t:
             self._interval = t - self._t
         self._t = t
@@ -209,9 +227,8 @@ class _Pairs:
 def _least_likely(states: Sequence[LiveTrack], image_size: tuple[int, int] | None, clutter: Array) -> Array:
     """Largest distance plus log volume at which a detection is no new object, (tracks, detections).
 
-    A target hidden for some time reappears at a rate of about once in that time, with a normal density; new objects
-    appear anywhere. A track that the last frame detected has no such limit, but for detections too weak to begin a
-    track, of which there are some everywhere.
+    A track that the last frame detected has no such limit, but for detections too weak to begin a track, of which there
+    are some everywhere.
 
     Args:
         states: tracks.
@@ -220,11 +237,8 @@ def _least_likely(states: Sequence[LiveTrack], image_size: tuple[int, int] | Non
     """
     if image_size is None:
         return np.full((len(states), len(clutter)), np.inf)
-    rate = states[0].settings.newcomers_hz
     hidden_s = np.array([[state.t - state.seen if state.missed else 0.0] for state in states])
-    density = (rate * hidden_s + clutter) / math.prod(image_size)
-    with np.errstate(divide="ignore"):
-        return np.asarray(-2 * np.log(2 * math.pi * density))
+    return least_likely(states[0].settings, hidden_s, image_size, clutter)
 
 
 def _boxes_of(states: Sequence[LiveTrack]) -> tuple[Array, Array]:

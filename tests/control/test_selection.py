@@ -67,6 +67,23 @@ def test_first_come_stays_until_its_target_is_gone():
 
 
 @pytest.mark.parametrize("make", POLICIES.values(), ids=POLICIES)
+def test_what_is_hidden_is_waited_for_only_while_nothing_else_is_in_sight(make):
+    behind = replace(candidate(1, leaves=1.0), track=replace(track(1), missed=30, hidden=True))
+    selector = make()
+    assert selector.select([behind], STILL, LIMITS) == 1
+    assert selector.select([behind, candidate(2)], STILL, LIMITS) == 2
+
+
+def test_a_chosen_target_that_comes_out_elsewhere_is_taken_while_its_track_is_hidden():
+    selector = Chosen(number=1)
+    selector.start((640, 480))
+    assert selector.select([candidate(1)], STILL, LIMITS) == 1
+    behind = replace(candidate(1), track=replace(track(1, t=1.0), missed=30, hidden=True))
+    assert selector.select([behind], STILL, LIMITS) == 1
+    assert selector.select([behind, candidate(2, center=(330.0, 240.0), t=1.0)], STILL, LIMITS) == 2
+
+
+@pytest.mark.parametrize("make", POLICIES.values(), ids=POLICIES)
 def test_what_is_unlikely_is_looked_at_only_where_nothing_else_is(make):
     cloud = replace(candidate(1, leaves=1.0), likely=False)
     selector = make()

@@ -588,3 +588,30 @@ def test_the_head_stands_still_for_a_person_who_stands_close(speed):
     for angle in (pan, tilt):
         assert np.ptp(angle[cut]) < math.radians(12)
         assert np.ptp(angle[t > 18.0]) < math.radians(2)
+
+
+def test_place_and_velocity_in_the_fixed_image_are_those_of_the_predicted_position():
+    """The velocity is that of the predicted position, the covariance that of sampled states; the camera is turned."""
+    _, estimate = last(Flight("person", 0), delay=0.5)
+    assert estimate is not None
+    camera = estimate.calibration.fixed.turned(np.array([20.0, -10.0]))
+    state, covariance = estimate.in_fixed(camera)
+
+    def seen(x):
+        # Turned to the left by 20 px in the middle, all that it shows has moved to the right by as much.
+        return camera.project(math.exp(x[2]) * np.array([x[0], x[1], 1.0]))
+
+    np.testing.assert_allclose(state[:2], seen(estimate.state))
+    moved, dt = estimate.state.copy(), 1e-4
+    moved[:3] += dt * np.append(moved[3:5] - moved[5] * moved[:2], moved[5])
+    np.testing.assert_allclose(state[2:], (seen(moved) - seen(estimate.state)) / dt, rtol=1e-2, atol=0.05)
+    samples = np.random.default_rng(0).multivariate_normal(estimate.state, estimate.state_covariance, 4000)
+    drawn = np.cov([seen(x) for x in samples], rowvar=False)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)[:2]), np.sqrt(np.diag(drawn)), rtol=0.1)
+
+
+def test_a_turned_camera_projects_where_its_pixels_look():
+    camera = CALIBRATION.fixed.turned(np.array([20.0, -10.0]))
+    x_fixed = np.array([0.5, -0.3, 8.0])
+    tangents, _ = camera.tangents(camera.project(x_fixed))
+    np.testing.assert_allclose(tangents, x_fixed[:2] / x_fixed[2], atol=1e-9)

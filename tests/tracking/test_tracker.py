@@ -180,6 +180,45 @@ def test_track_ends_after_its_time_and_its_number_is_not_used_again():
     assert [t.id for t in tracks[-1]] == [2]
 
 
+def hidden(sigma_px, hidden_s, comes_out_at, seen_s=3.0):
+    """The last frame's tracks after a target at (300, 200) was hidden, and expected there with a deviation."""
+    tracker, times = Tracker(PLAIN, SIZE), np.arange(0.0, seen_s, 1 / RATE)
+    run(tracker, times, ((300, 200), (0, 0)))
+    expected = {1: (np.array([300.0, 200.0, 0.0, 0.0]), np.diag([sigma_px**2] * 2 + [1.0] * 2))}
+    count = round(hidden_s * RATE)
+    for i in range(1, count):
+        tracks = tracker.update([], times[-1] + i / RATE, expected=expected)
+        assert [track.hidden for track in tracks] == [i / RATE > PLAIN.lose_s]
+    return tracker.update([seen(*comes_out_at)], times[-1] + count / RATE, expected=expected)
+
+
+def test_a_hidden_target_that_comes_out_where_it_is_expected_keeps_its_number():
+    (track,) = hidden(30.0, 2.0, (330, 215))
+    assert (track.id, track.confirmed, track.missed, track.hidden) == (1, True, 0, False)
+    assert np.abs(track.center_px - (330, 215)).max() < NOISE_PX
+    tracks = hidden(30.0, 2.0, (430, 200))  # more than three deviations off: something else
+    assert [(track.id, track.confirmed, track.hidden) for track in tracks] == [(1, True, True), (2, False, False)]
+
+
+@pytest.mark.parametrize(("sigma_px", "alive"), [(150.0, True), (165.0, False)])
+def test_a_hidden_target_is_kept_while_it_is_likelier_to_come_out_than_something_new(sigma_px, alive):
+    """One likely place of 2 pi sigma^2 against two new objects a second in 640x480: 156 px after 1 s."""
+    tracker, times = Tracker(PLAIN, SIZE), np.arange(0.0, 3.0, 1 / RATE)
+    run(tracker, times, ((300, 200), (0, 0)))
+    expected = {1: (np.array([300.0, 200.0, 0.0, 0.0]), np.diag([sigma_px**2] * 2 + [1.0] * 2))}
+    for i in range(1, round(RATE) + 1):
+        tracks = tracker.update([], times[-1] + i / RATE, expected=expected)
+    assert bool(tracks) is alive
+
+
+def test_a_target_is_not_expected_for_longer_than_it_was_seen_nor_by_another_one():
+    with pytest.raises(AssertionError):
+        hidden(5.0, 2.0, (300, 200), seen_s=1.2)
+    tracker = Tracker(PLAIN, SIZE)
+    run(tracker, np.arange(0.0, 3.0, 1 / RATE), ((300, 200), (0, 0)))
+    assert tracker.update([], 2.96 + PLAIN.lose_s + 1 / RATE, expected={7: (np.zeros(4), np.eye(4))}) == []
+
+
 @pytest.mark.parametrize(("side", "most"), [(4.0, 2), (20.0, 8)])
 def test_a_prediction_is_reported_while_it_is_known_to_within_the_box(side, most):
     """A prediction's deviation is the square root of q t^3 / 3 at least: 2 px after 0.12 s, 10 px after 0.35 s."""
