@@ -16,6 +16,7 @@ from cotarget.control.policy import OnnxPolicy, Situation, ahead_s, rates_of, ta
 from cotarget.control.zoom import ZoomController, ZoomSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
+from cotarget.pantilt import towards
 from cotarget.rig import Angles, PanTiltState, Rig, Speed
 from cotarget.targeting import Aim, Reach, aim
 
@@ -79,7 +80,7 @@ class Controller:
         if self._policy is not None:
             self._obey(self._policy, effect_t, first, then, seen_t, interval)
             return first, "wanted"
-        self._command_head(effect_t, target, first, then, interval)
+        self._command_head(predict, effect_t, target, first, then, interval)
         pan, tilt, focal = self.commanded
         now = self._rig.clock.now()
         exposed = interval + (now + self._rig.spec.zoom.delay_s)
@@ -146,7 +147,7 @@ class Controller:
         seen = target.appearance(first.pan, first.tilt, self._rig.zoom.focal_range[0])
         if seen is None or (seen.sigma_px > np.array(self._rig.zoom.size) / 2).any():
             return None
-        self._command_head(effect_t, target, first, then, interval)
+        self._command_head(predict, effect_t, target, first, then, interval)
         return first
 
     def _predict_over_lead(self, predict: Predict, seen_t: float, interval: float) -> tuple[float, Estimate, Estimate]:
@@ -177,10 +178,13 @@ class Controller:
         first = self._aim(target, reach)
         return first, self._aim(later, reach, first)
 
-    def _command_head(self, effect_t: float, target: Estimate, first: Aim, then: Aim, interval: float) -> None:
+    def _command_head(
+        self, predict: Predict, effect_t: float, target: Estimate, first: Aim, then: Aim, interval: float
+    ) -> None:
         """Send the head unless it is held.
 
         Args:
+            predict: gives the target's estimate at any time [s].
             effect_t: time at which a command given now takes effect [s].
             target: estimate of the target at that time.
             first: aim at ``effect_t``.
@@ -194,12 +198,24 @@ class Controller:
             (first.pan, first.tilt),
             ((then.pan - first.pan) / interval, (then.tilt - first.tilt) / interval),
             self._rig.zoom.size[0] / self._true(focal),
-            effect_t - target.measured_t,
+            self._lead(predict, effect_t, target),
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
             self.head_commands += 1
             self.commanded = (pan, tilt, focal)
+
+    def _lead(self, predict: Predict, effect_t: float, target: Estimate) -> Angles:
+        """Compute the way of pan and tilt from a target's last measurement to its estimate at ``effect_t`` [rad].
+
+        The rate at its end would not do: an acceleration that is noise moves it twice as far as the target.
+        """
+        measured = predict(target.measured_t) if target.measured_t < effect_t else None
+        if measured is None:
+            return 0.0, 0.0
+        T = self._calibration.zoom_head.T_base_fixed
+        (pan, tilt), (pan_before, tilt_before) = (towards(T.apply(each.x_fixed)) for each in (target, measured))
+        return pan - pan_before, tilt - tilt_before
 
     def zoom_out(self) -> None:
         """Send the lens to its shortest focal length; the head waits."""

@@ -261,7 +261,7 @@ class HeadController:
         wanted: Angles,
         rates: Angles,
         field: float,
-        lead_s: float = 0.0,
+        lead: Angles = (0.0, 0.0),
     ) -> HeadCommand | None:
         """Decide on a command for the head.
 
@@ -271,13 +271,14 @@ class HeadController:
             wanted: wanted pan and tilt at ``effect_t`` [rad].
             rates: rates of these [rad/s].
             field: horizontal angle of view [rad].
-            lead_s: time from the last measurement to ``effect_t`` [s]; a slow axis does not lead by all of it.
+            lead: way of ``wanted`` from the last measurement to ``effect_t`` [rad]; a slow axis does not lead by all of
+                it.
 
         Returns:
             The command; None if the head is best left alone.
         """
         zone = max(self._settings.zone * field, *(axis.step for axis in self._limits.axes))
-        reference = self._damped(wanted, rates, zone, lead_s)
+        reference = self._damped(wanted, rates, zone, lead)
         resting = (
             self._axes_at_rest(effect_t, interval_s, reference, zone) if self._settings.deadband else [False, False]
         )
@@ -314,13 +315,13 @@ class HeadController:
         self.head.add_command(effect_t, command)
         return command
 
-    def _damped(self, wanted: Angles, rates: Angles, zone: float, lead_s: float) -> _Reference:
+    def _damped(self, wanted: Angles, rates: Angles, zone: float, lead: Angles) -> _Reference:
         """Remove speed and lead from slow axes, where they are mostly noise."""
         limit = self._settings.slow * zone
         slow = tuple(abs(rate) * scale <= limit for rate, scale in zip(rates, _scales(wanted[1]), strict=True))
         still = _angle_between(rates, (0.0, 0.0), wanted[1]) <= limit / 2
-        back_s = lead_s if still else self._settings.slow_lead * lead_s
-        pan, tilt = (q - back_s * rate if at_rest else q for q, rate, at_rest in zip(wanted, rates, slow, strict=True))
+        part = 1.0 if still else self._settings.slow_lead
+        pan, tilt = (q - part * way if at_rest else q for q, way, at_rest in zip(wanted, lead, slow, strict=True))
         pan_rate, tilt_rate = (0.0 if at_rest else rate for rate, at_rest in zip(rates, slow, strict=True))
         return _Reference((pan, tilt), (pan_rate, tilt_rate), (slow[0], slow[1]), still)
 

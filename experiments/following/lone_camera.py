@@ -237,7 +237,8 @@ class LoneCamera:
         wanted, _ = course.at(effect)
         true_px = self._zoom.at(self._focal).focal_px[0]
         field = rig.zoom.size[0] / true_px
-        command = self._head_controller.decide(effect, interval, wanted, course.rates, field, effect - course.seen_t)
+        pan, tilt = ((effect - course.seen_t) * rate for rate in course.rates)
+        command = self._head_controller.decide(effect, interval, wanted, course.rates, field, (pan, tilt))
         if command is not None:
             rig.head.move(command.pan, command.tilt, command.speed)
         exposed = effect + interval

@@ -95,10 +95,10 @@ SETTLED = 7.4, 9.0  # who stops at 5 s and is known of 0.6 s later, with a head 
 NO_WORSE = 1.2  # times the wide view's own offset: medians of 50 frames
 ZONE = HeadSettings().zone  # the head of who stands is left alone in it
 SWING = ZONE / 2  # an offset that goes to and fro beyond it on both sides swings
-SEED = 5  # of the detector's noise; seen 0.6 s late, five of seeds 0 to 7 swing on an axis
+SEEDS = 1, 7  # of the detector's noise; seen 0.6 s late, they swung 2 and 4 times with a lead by the rate at its end
 
 
-def offsets_of_who_stops(exact, delay_s, closed_loop, seed=SEED):
+def offsets_of_who_stops(exact, delay_s, closed_loop, seed=SEEDS[0]):
     """Offsets over the width, (n, 2), of one who walks past 10 m away at 1.5 m/s and stops, while walking and after.
 
     Nothing is rendered: both views show the person where it is, with noise.
@@ -132,19 +132,20 @@ def swings(values):
 def test_the_whole_loop_does_not_oscillate_however_late_it_is(exact, delay_s):
     """Corrections that come late add nothing to the offset of who walks, and come to rest when that stops."""
     wide, _ = offsets_of_who_stops(exact, delay_s, closed_loop=False)
-    walking, after = offsets_of_who_stops(exact, delay_s, closed_loop=True)
-    offset, alone = (float(np.median(np.linalg.norm(each, axis=1))) for each in (walking, wide))
-    assert offset < NO_WORSE * alone
-    assert np.linalg.norm(after, axis=1).max() < 1.5 * ZONE  # of which half is the error of where it is taken to be
-    assert [swings(axis) for axis in after.T] == [0, 0]
+    alone = float(np.median(np.linalg.norm(wide, axis=1)))
+    for seed in SEEDS:
+        walking, after = offsets_of_who_stops(exact, delay_s, closed_loop=True, seed=seed)
+        assert float(np.median(np.linalg.norm(walking, axis=1))) < NO_WORSE * alone
+        assert np.linalg.norm(after, axis=1).max() < ZONE
+        assert [swings(axis) for axis in after.T] == [0, 0]
 
 
 @pytest.mark.slow
-def test_the_head_swings_no_more_than_once_a_seed_seen_late(exact):
-    """A single seed of the detector's noise swings or not by chance; the mean of 48 was 1.0 before any number went."""
+def test_the_head_swings_with_no_seed_seen_late(exact):
+    """Eight seeds of the detector's noise."""
     ends = [offsets_of_who_stops(exact, 0.6, closed_loop=True, seed=seed)[1] for seed in range(8)]
-    assert sum(swings(axis) for after in ends for axis in after.T) <= len(ends)
-    assert max(np.linalg.norm(after, axis=1).max() for after in ends) < 1.5 * ZONE
+    assert [swings(axis) for after in ends for axis in after.T] == [0] * 2 * len(ends)
+    assert max(np.linalg.norm(after, axis=1).max() for after in ends) < ZONE
 
 
 # ---------------------------------------------------------------- first shot
