@@ -19,6 +19,8 @@ DARKEST, BRIGHTEST = 1 / 3, 1.5
 # Images are compared if their exposures differ by at most this part, because a codec draws texture again; time over
 # which exposures are averaged for it, so that a lamp may flicker and a cloud pass [s].
 SAME_EXPOSURE, AVERAGED_S = 0.02, 0.5
+# Largest change of a lamp that flickers from one image to the next; beyond it a light was switched or the film was cut.
+FLICKER = 0.15
 
 
 class Exposure:
@@ -28,10 +30,11 @@ class Exposure:
         """Start without a reference."""
         self._reference: Array | None = None
         self._t = 0.0
+        self._change = 1.0  # of the last image that shows the same picture
         self._changed_t: float | None = None  # since when the picture is another
 
     def measure(self, image: Image, t: float) -> float:
-        """Return an image's brightness over that of the reference; 1 where the picture has changed.
+        """Return an image's brightness over that of the reference; the last one where the picture has changed.
 
         It is the median ratio over cells of the image, so that a target may cover nearly half of it.
 
@@ -48,8 +51,8 @@ class Exposure:
         if np.mean(np.abs(ratio / change - 1) < AGREEMENT) < FEWEST or not DARKEST < change < BRIGHTEST:
             self._changed_t = t if self._changed_t is None else self._changed_t
             if t - self._changed_t >= LASTING_S:
-                self._reference, self._changed_t = cells, None
-            return 1.0
-        self._changed_t = None
+                self._reference, self._changed_t = cells / self._change, None
+            return self._change
+        self._change, self._changed_t = change, None
         self._reference = self._reference + (1 - math.exp(-since / HISTORY_S)) * (cells - self._reference)
         return change

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import TargetProfile
+from cotarget.config import DEFAULT_TARGETS, TargetProfile
 from cotarget.detection import AutoDetector, make_detector
 from cotarget.detection.background import LargeTargetFinder
 from cotarget.pipeline import CameraRun
@@ -317,6 +317,22 @@ def test_a_bird_is_found_under_a_lamp_that_flickers(rate):
     tracks = follow(pictures, rate, rng)
     right = [on(each, np.add(place, (4, 2)), 4) for each, place in zip(tracks, places, strict=True) if place]
     assert np.mean([bool(each) for each in right[20:]]) >= FOUND
+
+
+def test_a_bird_is_found_soon_after_a_sky_of_another_brightness_is_shown():
+    """A film of the sky is cut: no corner shows it, and the new part is darker by a third."""
+    rng, rate = np.random.default_rng(10), 30.0
+    sky = np.repeat(np.linspace(220, 200, 240)[:, None, None], 320, axis=1) * np.ones(3)
+    bird = np.full((5, 9, 3), 60.0)
+    places = [(20 + 3 * i, 40) for i in range(40)] + [(20 + 3 * i, 120) for i in range(20)]
+    detector = make_detector(DEFAULT_TARGETS["bird"], rate)
+    found = []
+    for i, picture in enumerate(moved(sky, bird, places)):
+        shown = np.clip(picture * (1.0 if i < 40 else 0.66) + rng.normal(0, 1, picture.shape), 0, 255).astype(np.uint8)
+        boxes = detector.detect(Frame(shown, i / rate)).boxes
+        found.append(any(np.abs(box.center_px - places[i] - (4, 2)).max() < 4 for box in boxes))
+    assert np.mean(found[10:40]) == 1.0
+    assert np.mean(found[50:]) == 1.0  # after a third of a second
 
 
 def test_a_lamp_that_is_switched_on_over_rough_ground_makes_no_target():

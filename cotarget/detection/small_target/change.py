@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from cotarget.detection.exposure import AVERAGED_S, SAME_EXPOSURE
+from cotarget.detection.exposure import AVERAGED_S, FLICKER, SAME_EXPOSURE
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
@@ -37,7 +37,7 @@ class History:
         """Start without images."""
         self._kept: deque[tuple[float, Image, Array, float]] = deque()
         self._last: Image | None = None
-        self._exposure = 1.0  # of the last image, without flicker
+        self._exposure = self._last_exposure = 1.0  # of the last image, without flicker and with it
         self.noise = LEAST_NOISE
 
     @property
@@ -69,6 +69,9 @@ class History:
             usual = difference[difference <= 2 * float(np.median(difference)) + 2]
             self.noise = max(LEAST_NOISE, float(usual.mean()) / MEDIAN_OF_NORMAL / np.sqrt(2.0))
         self._last = grey
+        if abs(exposure / self._last_exposure - 1) > FLICKER:
+            self._kept.clear()
+        self._last_exposure = exposure
         if not self._kept or t - self._kept[-1][0] >= SPACING_S:
             since = t - self._kept[-1][0] if self._kept else math.inf
             self._exposure += (1 - math.exp(-since / AVERAGED_S)) * (exposure - self._exposure)
