@@ -101,6 +101,27 @@ def test_small_targets_of_all_sizes_are_found_where_they_are(size):
         assert -0.1 * size - 1 <= box.size_px[0] - size <= 2.5
 
 
+def test_a_helicopter_before_clouds_is_boxed_with_its_blurred_rotor():
+    """The rotor is an eighth as dark as the body, and no darker than the sky elsewhere; a codec leaves little noise."""
+    rng = np.random.default_rng(12)
+    rows, columns = np.mgrid[:480, :640]
+    sky = 150 + 25 * np.sin(columns / 200) * np.sin(rows / 150)
+    for i in range(20):
+        picture, u = sky.copy(), 200 + 4 * i
+        cv2.rectangle(picture, (u - 52, 200), (u + 52, 205), -1, cv2.FILLED)
+        rotor = picture == -1
+        picture[rotor] = sky[rotor] - 15
+        cv2.ellipse(picture, (u, 222), (30, 18), 0, 0, 360, 40, cv2.FILLED)
+        shown = noisy(np.repeat(cv2.GaussianBlur(picture, (0, 0), 0.7)[..., None], 3, axis=2), rng, 1.0)
+        if i == 0:
+            detector = make_detector(SPECK, RATE)
+        boxes = detector.detect(Frame(shown, i / RATE)).boxes
+        if i >= 10:
+            (box,) = [box for box in boxes if box.score > 0.5]
+            np.testing.assert_allclose(box.center_px, (u, 220), atol=4.0)
+            np.testing.assert_allclose(box.size_px, (105, 41), atol=8.0)
+
+
 def test_a_bird_of_one_pixel_before_a_plain_sky_is_found():
     """50 grey levels darker, over a noise of 2; the mean of three by three pixels shows a tenth of that."""
 

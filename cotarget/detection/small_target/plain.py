@@ -4,12 +4,17 @@ The background is the median over half the image's width, in a small image: what
 it. A region is what differs from it by more than the usual difference.
 """
 
+import math
+
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from cotarget.detection.small_target.contrast import SmallTarget
+from cotarget.detection.base import pieces
+from cotarget.detection.small_target.contrast import OUTLINE, SmallTarget
 from cotarget.rig import Image
 
+Box = tuple[int, int, int, int]  # left, top, width and height [px]
 # Image in which the background is found, in which regions are found, and the least larger side of a region, in parts of
 # the image's width.
 COARSE_PART, FINE_PART, LEAST_PART = 8 / 640, 2 / 640, 40 / 640
@@ -20,8 +25,13 @@ TIMES, LEAST_LEVELS = 4.0, 3.0
 # Least difference of a region's parts, over its largest one. If anything beside it differs by more, it is no whole: a
 # person's coat before a wall has legs and head beside it.
 FAINTEST = 0.15
+# Least difference from its own surroundings of what reaches farther from a region than its blurred edge, over the
+# region's largest difference: rotors; and the width of that edge [px].
+FAINT, BLUR_PX = 0.06, 3
 # Gap that is closed within a region, in pixels of the image in which they are found.
 GAP_PX = 5
+# Pixels, about, in which a region and its surroundings are sampled.
+SAMPLES = 1000
 
 
 def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
@@ -65,18 +75,72 @@ def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
         if beside > FAINTEST * contrast:
             continue
         around = float(ground[y : y + h, x : x + w].mean())
-        low, size = _outline(grey, ground, (x, y, w, h), unit, max(unit * TIMES * usual, FAINTEST * contrast))
-        low, size = (times * low[0], times * low[1]), (times * size[0], times * size[1])
-        found.append(SmallTarget(low, size, contrast, contrast / usual, around, beside, whole=True))
+        box = _outline(grey, (unit * x, unit * y, unit * w, unit * h), unit, contrast)
+        x, y, w, h = (times * side for side in box)
+        found.append(SmallTarget((x, y), (w, h), contrast, contrast / usual, around, beside, whole=True))
     return found
 
 
-def _outline(
-    grey: Image, ground: Image, box: tuple[int, int, int, int], unit: int, least: float
-) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Find low and size of a region in full resolution from its box in an image reduced by a factor ``unit`` [px]."""
+def _outline(grey: Image, box: Box, unit: int, contrast: float) -> Box:
+    """Outline a region of a ``contrast`` [grey levels] before its own surroundings.
+
+    Blurred rotors and wing tips are as faint as the clouds of the whole image, and not as those nearby. They are part
+    of the region where they reach farther than a blurred edge. The result is the box of a region without an end nearby,
+    or cut by the image's border, because half of its surroundings are not seen.
+    """
     x, y, w, h = box
-    before = cv2.resize(ground[y : y + h, x : x + w], None, fx=unit, fy=unit, interpolation=cv2.INTER_LINEAR)
-    now = grey[unit * y : unit * (y + h), unit * x : unit * (x + w)]
-    dx, dy, w, h = cv2.boundingRect(cv2.compare(cv2.absdiff(now, before), least, cv2.CMP_GT))
-    return (unit * x + dx, unit * y + dy), (w, h)
+    height, width = grey.shape
+    if min(x, y) < unit or x + w > width - unit or y + h > height - unit:
+        return box
+    reach = max(w, h) // 2
+    left, top = max(0, x - reach), max(0, y - reach)
+    window = grey[top : y + h + reach, left : x + w + reach]
+    inside = x - left, y - top, w, h
+    plane, usual = _surroundings(window, inside, reach / 2)
+    off = cv2.absdiff(window, plane)
+    least = unit * max(TIMES * usual, LEAST_LEVELS)
+    masks = (cv2.compare(off, max(least, part * contrast), cv2.CMP_GT) for part in (OUTLINE, FAINT))
+    core, whole = (_edges(mask, inside) for mask in masks)
+    if core is None or whole is None:
+        return box
+    x0, y0, x1, y1 = np.add(np.where(np.abs(whole - core) > BLUR_PX, whole, core), (left, top) * 2).tolist()
+    bottom, right = np.add((top, left), window.shape)
+    if 0 < x0 == left or 0 < y0 == top or x1 == right < width or y1 == bottom < height:
+        return box
+    return x0, y0, x1 - x0, y1 - y0
+
+
+def _surroundings(window: Image, box: Box, near: float) -> tuple[Image, float]:
+    """Fit a plane of grey levels to what is farther than ``near`` [px] from a box; return it and the usual difference.
+
+    A box that leaves hardly anything beside it has no usual difference, but inf.
+    """
+    x, y, w, h = box
+    step = max(1, round(math.sqrt(window.size / SAMPLES)))
+    v, u = (n.ravel() for n in np.mgrid[: window.shape[0] : step, : window.shape[1] : step])
+    beside = (np.abs(u - x - w / 2) > w / 2 + near) | (np.abs(v - y - h / 2) > h / 2 + near)
+    if np.count_nonzero(beside) < SAMPLES / 10:
+        return window, math.inf
+    v, u = v[beside], u[beside]
+    places, levels = np.stack([u, v, np.ones(len(u))], axis=1), window[v, u].astype(float)
+    for _ in range(2):  # the second time without what stands out
+        fit = np.linalg.lstsq(places, levels, rcond=None)[0]
+        off = np.abs(places @ fit - levels)
+        usual = float(np.median(off))
+        plain = off <= max(TIMES * usual, LEAST_LEVELS)
+        places, levels = places[plain], levels[plain]
+    rows, columns = (np.arange(n, dtype=np.float32) for n in window.shape)
+    a, b, c = fit.astype(np.float32)
+    return np.asarray(cv2.convertScaleAbs(a * columns + (b * rows + c)[:, None]), dtype=np.uint8), usual
+
+
+def _edges(mask: Image, box: Box) -> npt.NDArray[np.int_] | None:
+    """Left, top, right and bottom of the components of a mask that are mostly in a box or hold most of it, (4,).
+
+    None if there is none.
+    """
+    low, size = np.split(np.reshape(pieces(mask, (1, 1)), (-1, 4)), 2, axis=1)
+    high, begin, end = low + size, np.array(box[:2]), np.add(box[:2], box[2:])
+    shared = np.maximum(np.minimum(high, end) - np.maximum(low, begin), 0).prod(axis=1)
+    own = 2 * shared > np.minimum(size.prod(axis=1), (end - begin).prod())
+    return np.concatenate([low[own].min(axis=0), high[own].max(axis=0)]) if own.any() else None
