@@ -140,7 +140,7 @@ def _run(
 
 
 def _row(index: int, t: float, track: Track, size: tuple[int, int]) -> list[str]:
-    center, extent = within_image(track.center_px, track.size_px, size)
+    center, extent = within_image(track.center_px, track.whole_px, size)
     numbers = (*center, *extent)
     score = track.score if track.missed == 0 else 0.0
     return [str(index), f"{t:.4f}", str(track.id), *(f"{x:z.2f}" for x in numbers), f"{score:.3g}"]
@@ -164,10 +164,10 @@ class Trails:
         for track in tracks:
             colour = COLOURS[track.id % len(COLOURS)]
             way = np.array([center for _, center in self._trails[track.id]])
-            beside = (np.abs(way - track.center_px) > track.size_px / 2 + BOX_MARGIN_PX).any(axis=1)
+            beside = (np.abs(way - track.center_px) > track.whole_px / 2 + BOX_MARGIN_PX).any(axis=1)
             way = way[beside]  # a small target stays visible
             cv2.polylines(image, [np.rint(way).astype(np.int32).reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA)
-            draw_box(image, track.center_px, track.size_px, colour, str(track.id), bold=track.missed == 0)
+            draw_box(image, track.center_px, track.whole_px, colour, str(track.id), bold=track.missed == 0)
         return image
 
 

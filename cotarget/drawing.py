@@ -166,7 +166,7 @@ def draw_wide(step: Step, factor: float = 1.0) -> Image:
             followed = step.target is not None and track.id == step.target.id
             center = factor * (track.center_px + 0.5) - 0.5
             draw_box(
-                image, center, factor * track.size_px, FOLLOWED if followed else FOUND, f"{track.id}", bold=followed
+                image, center, factor * track.whole_px, FOLLOWED if followed else FOUND, f"{track.id}", bold=followed
             )
     return image
 

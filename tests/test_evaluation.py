@@ -107,7 +107,7 @@ def track(number, center_px, t=0.0, box_px=None, confirmed=True, missed=0, share
     """A track whose filtered middle need not be where its last detection is."""
     center, size = np.array(center_px, dtype=float), np.array([16.0, 12.0])
     box = Detection(center if box_px is None else np.array(box_px, dtype=float), size, 1.0)
-    found = Track(number, t, confirmed, missed, center, np.zeros(2), size, 16.0, np.eye(4), 1.0, box)
+    found = Track(number, t, confirmed, missed, center, np.zeros(2), size, size, 16.0, np.eye(4), 1.0, box)
     return dataclasses.replace(found, shared=shared)
 
 

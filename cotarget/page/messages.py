@@ -152,7 +152,7 @@ def describe(step: Step, spec: RigSpec, skipped: int) -> dict[str, Any]:
             for name, frame in _frames(step).items()
         },
         "tracks": [
-            [track.id, *_rounded(track.center_px), *_rounded(track.size_px)] for track in step.tracks if track.reported
+            [track.id, *_rounded(track.center_px), *_rounded(track.whole_px)] for track in step.tracks if track.reported
         ],
         "heads": {HEAD: _head(step, spec)},
         "steps": step.index + 1,

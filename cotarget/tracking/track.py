@@ -116,12 +116,12 @@ class SizeHistory:
         self.size: Array = np.zeros(2)
         self.larger_side = 0.0
 
-    @property
-    def whole(self) -> Array:
-        """Width and height of the whole target [px], (2,): the usual ones, or the largest where it never shrinks."""
+    def whole(self, span_s: float) -> Array:
+        """Width and height of the whole target [px], (2,): of what flies the largest in a time [s], else the usual."""
         if self._trend:
             return self.size
-        sides = zip(*(size for _, size, _ in self._boxes), strict=True)
+        begin = self._boxes[-1][0] - span_s
+        sides = zip(*(size for t, size, _ in self._boxes if t >= begin), strict=True)
         return np.maximum(self.size, [_quantile(lengths, BEAT_PART) for lengths in sides])
 
     def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
@@ -367,6 +367,7 @@ class Track:
         center_px: filtered centre (u, v), (2,).
         velocity_px: velocity (du, dv) [px/s], (2,).
         size_px: filtered width and height, (2,).
+        whole_px: width and height with wings and rotors: of what flies the largest over a wing beat, else `size_px`.
         larger_side_px: larger side over the last wing beat [px].
         covariance: covariance of (u, v, du, dv), (4, 4).
         score: score of the last detection, 0 to 1.
@@ -383,6 +384,7 @@ class Track:
     center_px: Array
     velocity_px: Array
     size_px: Array
+    whole_px: Array
     larger_side_px: float
     covariance: Array
     score: float
@@ -454,7 +456,7 @@ class LiveTrack:
     @property
     def whole(self) -> Array:
         """Width and height of the whole target, of which a piece may be seen now [px], (2,)."""
-        return self._sizes.whole
+        return self._sizes.whole(WHOLE_S)
 
     def predict(self, t: float) -> None:
         """Predict the track at time ``t`` [s]."""
@@ -544,6 +546,7 @@ class LiveTrack:
             center_px=np.array(self.center),
             velocity_px=np.array([u.velocity, v.velocity]),
             size_px=self.size.copy(),
+            whole_px=self._sizes.whole(BEAT_S),
             larger_side_px=self._sizes.larger_side,
             covariance=np.array(
                 [

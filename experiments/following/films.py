@@ -430,7 +430,7 @@ def _confirmed(tracker: Tracker, index: int, frame: Frame) -> list[Tracked]:
     """Give the reported tracks of a frame as boxes, which end at the image's border as labels do."""
     height, width = frame.image.shape[:2]
     return [
-        Tracked(*within_image(track.center_px, track.size_px, (width, height)), index, frame.t, track.id)
+        Tracked(*within_image(track.center_px, track.whole_px, (width, height)), index, frame.t, track.id)
         for track in tracker.tracks
         if track.reported
     ]

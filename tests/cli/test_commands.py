@@ -343,7 +343,7 @@ def chosen(*arguments, recorded=None):
 
 def track(number, center=(1, 1), confirmed=True):
     center, size = np.array(center, float), np.array([20.0, 30.0])
-    return Track(number, 0.0, confirmed, 0, center, np.zeros(2), size, 30.0, np.eye(4), 1.0, None)
+    return Track(number, 0.0, confirmed, 0, center, np.zeros(2), size, size, 30.0, np.eye(4), 1.0, None)
 
 
 @pytest.mark.parametrize(("arguments", "recorded", "number"), [

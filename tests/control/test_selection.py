@@ -33,7 +33,7 @@ nearest_deadline, most_served = POLICIES["nearest-deadline"], POLICIES["most-ser
 
 def track(number, center=(320.0, 240.0), velocity=(0.0, 0.0), size=(20.0, 20.0), t=0.0):
     center, velocity, size = (np.array(each, float) for each in (center, velocity, size))
-    return Track(number, t, True, 0, center, velocity, size, float(size.max()), np.eye(4), 1.0, None)
+    return Track(number, t, True, 0, center, velocity, size, size, float(size.max()), np.eye(4), 1.0, None)
 
 
 def candidate(number, pan=0.0, *, rate=0.0, leaves=math.inf, seen=0.0, **where):

@@ -55,7 +55,9 @@ def box_at(x, y, z, size=BOOK.size, wrong=1.0):
 def track(number, box, t=0.0, *, missed=0, confirmed=True, larger=None):
     side = float(box.size_px.max()) if larger is None else larger
     still = np.zeros(2)
-    return Track(number, t, confirmed, missed, box.center_px, still, box.size_px, side, np.eye(4), 1.0, box)
+    return Track(
+        number, t, confirmed, missed, box.center_px, still, box.size_px, box.size_px, side, np.eye(4), 1.0, box
+    )
 
 
 class Pair:

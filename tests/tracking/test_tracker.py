@@ -154,6 +154,20 @@ def test_sizes():
     assert track.size_px.tolist() == [16, pytest.approx(20, abs=4.0)]
 
 
+def test_a_whole_flyer_is_as_large_as_its_rotor_showed_it_in_the_last_beat_and_follows_its_growth():
+    """The rotor is seen in every third frame, while the aircraft comes nearer, by a half each second."""
+    tracker = Tracker(tracking_settings(MOVING_BIRD), SIZE)
+    for i in range(40):
+        side = 60 * 1.5 ** (i / RATE)
+        (track,) = tracker.update([seen(100 + 3 * i, 200, side if i % 3 == 0 else side / 2, side / 2)], i / RATE)
+    np.testing.assert_allclose(track.whole_px, (side, side / 2), rtol=0.1)
+    assert track.size_px[0] < 0.6 * side
+    walker = Tracker(tracking_settings(DEFAULT_TARGETS["person"]), SIZE)
+    for i in range(40):
+        (track,) = walker.update([seen(100 + i, 200, 40 if i % 3 == 0 else 20, 60)], i / RATE)
+    assert track.whole_px.tolist() == track.size_px.tolist()
+
+
 def test_one_wrong_box_hardly_changes_the_size():
     tracker = Tracker(PLAIN)
     for i in range(30):
