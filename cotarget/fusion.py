@@ -20,7 +20,7 @@ from cotarget.config import TargetProfile
 from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
 from cotarget.estimation.clock_offset import LEAST_S, ClockOffset
 from cotarget.estimation.measurement_model import Pose
-from cotarget.estimation.motion_model import GATE, HEAD_SIGMA
+from cotarget.estimation.motion_model import GATE, HEAD_SIGMA, LOG_DEPTH, VELOCITY
 from cotarget.estimation.target_filter import inflated
 from cotarget.estimation.zoom_matching import CloseupFinder, Finder, MatchingSettings, ZoomMeasurement, outline_size
 from cotarget.geometry import Array
@@ -80,6 +80,8 @@ def _around(kept: "deque[tuple[float, ...]]", t: float) -> Array:
     return np.array([kept[i] for i in range(first, min(first + POINTS, len(kept)))])
 
 
+# Longest time in which a target is covered by what it goes behind [s]: half of what its filter keeps.
+LONGEST_COVER_S = 0.75
 MakeFinder = Callable[[Calibration, TargetProfile], Finder]
 
 
@@ -411,6 +413,7 @@ class TargetFusion:
             if target.filter is None:
                 target.filter = self._make_filter()
             if target.track.missed:
+                self._leave_out_cover(target, frame.t)
                 continue
             if _was_part(target):
                 target.filter = self._make_filter()
@@ -436,6 +439,27 @@ class TargetFusion:
             )
 
         return sorted(self.targets.values(), key=last)[: self._settings.most_filters]
+
+    def _leave_out_cover(self, target: Target, t: float) -> None:
+        """Leave out what was observed while the target went behind something, once it is behind it.
+
+        The part that was left of it moved more slowly than the target. It is covered in the time in which it goes as
+        far as it is wide.
+
+        Args:
+            target: target out of sight.
+            t: time of the newest fixed frame [s].
+        """
+        assert target.filter is not None, "who is kept has one"
+        seen_t = target.track.seen_t
+        before = target.estimate(seen_t - LONGEST_COVER_S)
+        if before is None:
+            return
+        speed = math.exp(before.state[LOG_DEPTH]) * float(np.linalg.norm(before.state[VELOCITY]))
+        width = self._profile.size * min(self._profile.shape or 1.0, 1.0)
+        cover_s = min(width / speed if speed else math.inf, LONGEST_COVER_S)
+        if t - seen_t > cover_s:
+            target.filter = target.filter.without(seen_t - cover_s, seen_t)
 
     def _measure(self, target: Target, frame: Frame, mask: Image | None, finders: Sequence[Finder]) -> None:
         """Add a target's newest detection to its filter.

@@ -426,6 +426,17 @@ class TargetFilter:
                 fixed._insert(each)
         return fixed
 
+    def without(self, begin: float, end: float) -> "TargetFilter":
+        """Make a filter of the same target without the observations after ``begin`` and up to ``end`` [s]."""
+        if not any(begin < each.t <= end for each in self._observed):
+            return self
+        kept = TargetFilter(self._calibration, self._target, self._settings)
+        kept._base = self._base
+        for each in self._observed:
+            if not begin < each.t <= end:
+                kept._insert(each)
+        return kept
+
     def estimate(self, t: float) -> Estimate | None:
         """Estimate the target at a time [s], after the newest measurement or up to `history_s` before it.
 

@@ -118,18 +118,34 @@ class SizeHistory:
 
     def whole(self, span_s: float) -> Array:
         """Width and height of the whole target [px], (2,): of what flies the largest in a time [s], else the usual."""
-        if self._trend:
-            return self.size
-        begin = self._boxes[-1][0] - span_s
+        return self.size if self._trend else self._largest(self._boxes[-1][0] - span_s)
+
+    def _largest(self, begin: float = -math.inf) -> Array:
+        """Largest width and height since a time [s], but the usual ones at least [px], (2,)."""
         sides = zip(*(size for t, size, _ in self._boxes if t >= begin), strict=True)
         return np.maximum(self.size, [_quantile(lengths, BEAT_PART) for lengths in sides])
+
+    def forget_pieces(self) -> None:
+        """Forget the newest boxes that show a piece of the target, because it has gone behind something."""
+        least = PIECE * self._largest()
+        while len(self._boxes) > 1 and (self._boxes[-1][1] < least).any():
+            self._boxes.pop()
+        self._update()
+
+    def skip(self, seconds: float) -> None:
+        """Let a time out of sight [s] make no box older."""
+        self._boxes = deque((t + seconds, size, clipped) for t, size, clipped in self._boxes)
 
     def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
         """Add a box, see `Trail.add`, and update the sizes."""
         self._boxes.append((t, size, clipped))
         while self._boxes[0][0] < t - max(self._span_s, WHOLE_S):
             self._boxes.popleft()
-        boxes = [box for box in self._boxes if box[0] >= t - self._span_s]
+        self._update()
+
+    def _update(self) -> None:
+        """Compute the sizes from the boxes."""
+        boxes = [box for box in self._boxes if box[0] >= self._boxes[-1][0] - self._span_s]
         # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones. One that is far
         # smaller than a cut one shows a part that was seen first, such as a hand.
         largest = max((math.prod(sides) for _, sides, is_cut in boxes if is_cut), default=0.0)
@@ -469,6 +485,8 @@ class LiveTrack:
         for i, axis in enumerate(self._axes):
             axis.position, axis.velocity = float(state[i]), float(state[i + 2])
             axis.P = float(covariance[i, i]), float(covariance[i, i + 2]), float(covariance[i + 2, i + 2])
+        if self.hidden:
+            self._sizes.forget_pieces()
 
     def move(self, by: Array) -> None:
         """Move with the scene, by (du, dv) [px], because the camera has turned."""
@@ -482,6 +500,8 @@ class LiveTrack:
 
     def correct(self, detection: Detection) -> None:
         """Correct with a detection of this track alone."""
+        if self.hidden:
+            self._sizes.skip(self.t - self.seen)
         weight = 1 - math.exp(-(self.t - self.seen) / self.settings.score_s)
         self.mean_score += weight * (detection.score - self.mean_score)
         if self._whole:

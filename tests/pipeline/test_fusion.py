@@ -127,6 +127,26 @@ def test_a_nudge_of_the_fixed_camera_moves_no_target():
     assert "calibrate again" in fusion.fusion.warnings()[0]
 
 
+def test_what_was_seen_while_a_target_went_behind_a_wall_moves_no_prediction():
+    """Of a person who walks at 1.5 m/s, the part that is left before the wall's edge moves at half of that."""
+    fusion, edge, height = Pair(PERSON), 0.5, FOCAL * PERSON.size / 10.0
+
+    def shown(t):
+        left = -2.3 + 1.5 * t
+        right = min(left + 0.6, edge)
+        center = np.array([CENTER[0] + FOCAL * (left + right) / 2 / 10.0, CENTER[1]])
+        return Detection(center, np.array([FOCAL * (right - left) / 10.0, height]), 1.0)
+
+    covered_t = (edge + 2.3) / 1.5
+    count = math.floor((covered_t - 0.05) / FRAME_S)
+    seen_t = seen(fusion, lambda t: [track(1, shown(t), t)], count)
+    for i in range(count, count + 40):
+        lost = replace(track(1, shown(seen_t), i * FRAME_S, missed=i - count + 1), seen_t=seen_t)
+        fusion.show(i * FRAME_S, [lost])
+    t = (count + 39) * FRAME_S
+    assert fusion.estimate(1, t).x_fixed[0] == pytest.approx(-2.0 + 1.5 * t, abs=0.3)
+
+
 def test_a_missed_track_measures_nothing():
     """Its box is an old one, at another place."""
     fusion = Pair(BOOK)

@@ -214,6 +214,23 @@ def test_a_hidden_target_that_comes_out_where_it_is_expected_keeps_its_number():
     assert [(track.id, track.confirmed, track.hidden) for track in tracks] == [(1, True, True), (2, False, False)]
 
 
+def test_a_target_that_comes_out_piece_by_piece_has_the_number_and_size_of_before():
+    """40 px wide, at 60 px/s behind 180 px: its boxes shrink to 4 px, and after 2.5 s they grow from there."""
+    tracker, found = Tracker(replace(PLAIN, noise_of_size=0.04), SIZE), []
+    for t in np.arange(0.0, 7.0, 1 / RATE):
+        u = 120.0 + 60.0 * t
+        left, right = (u - 20, min(u + 20, 300.0)) if u < 390 else (max(u - 20, 480.0), u + 20)
+        boxes = [seen((left + right) / 2, 200, right - left, 100)] if right - left >= 4 else []
+        expected = {1: (np.array([u + 10, 200.0, 60.0, 0.0]), np.diag([25.0**2] * 2 + [9.0] * 2))}
+        found.append(tracker.update(boxes, t, expected=expected))
+    assert all(step[0].id == 1 and step[0].confirmed for step in found[round(RATE) :])
+    assert [track.id for track in found[-1]] == [1]
+    sliver = next(step[0] for step in found[round(5 * RATE) :] if not step[0].missed)
+    assert sliver.box.size_px[0] < 10
+    assert sliver.size_px[0] > 0.7 * 40  # smaller boxes are pieces
+    np.testing.assert_allclose(found[-1][0].size_px, (40, 100), atol=0.5)
+
+
 @pytest.mark.parametrize(("sigma_px", "alive"), [(150.0, True), (165.0, False)])
 def test_a_hidden_target_is_kept_while_it_is_likelier_to_come_out_than_something_new(sigma_px, alive):
     """One likely place of 2 pi sigma^2 against two new objects a second in 640x480: 156 px after 1 s."""
