@@ -44,7 +44,7 @@ LENS_STANDS_S = 0.8  # longest delay of a picture, after the lens has come to re
 STILL_PX, STILL_S = 0.25, 0.5  # the picture stands if its corners move by no more from frame to frame for so long
 UNMOVED_S = 3.0  # a picture that has not moved for so long after a command does not move [s]
 BACK_S = 5.0  # longest time without a frame [s]
-RESTLESS_S = 15.0  # longest time on the way to a place [s]
+RESTLESS_S, TURNS_S = 15.0, 5.0  # longest time on the way to a place, and of a slow turn [s]
 SLOWEST_S = 60.0  # longest time to wait for a picture that stands [s]
 CORNERS, WEAKEST, APART_PX = 200, 0.01, 8
 # Where the dome looks: parts of the field of view from the middle; each changes both axes.
@@ -522,8 +522,11 @@ def _turn(
     rig.clock.sleep_until(rig.clock.now() + phase_s)
     rate, t = math.radians(RAMP_DEG_S), rig.clock.now()
     _patiently(lambda: rig.head.move(*goal, speed=(rate, rate * TILTED)))
-    frames, moved, still, halted_s = [(frame.t, _grey(frame.image))], False, t, math.nan
+    frames, moved, still, halted_s, halts_at = [(frame.t, _grey(frame.image))], False, t, math.nan, t + TURNS_S
     while rig.clock.now() < t + SLOWEST_S:
+        if halt_s is None and rig.clock.now() > halts_at:  # see `_settled`
+            _patiently(rig.head.halt)
+            halts_at = math.inf
         if halt_s is not None and rig.clock.now() >= t + halt_s:
             halted_s, halt_s = rig.clock.now() - t, None
             rig.head.halt()

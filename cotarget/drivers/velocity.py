@@ -17,6 +17,7 @@ FLOW_S = 0.5  # goals that follow each other as soon move along
 # Factor of the tolerance of an axis that goes beyond its goal, and back with each new goal; its limit, in slacks.
 WIDER, WIDEST = 1.5, 10.0
 SWINGS = 2  # beyond a goal that count as chance, such as by a late status
+SLOW = 0.01  # of the highest speed: a goal that moves by less may rest, whatever the slack
 FLOW_GAIN = 0.4  # by which the newest pair of goals changes their estimated speed
 MEASURED_DEG = 1.0  # shortest step from which it is measured how far the device goes
 GAINS = (0.1, 10.0)  # of a device's steps that are believed
@@ -126,7 +127,7 @@ class SteeredAxis:
             goal, flow = min(max(goal, self._facts.lowest), self._facts.highest), 0.0
         here, coast = self._predicted(position, t, now)
         gain = GAIN_HZ
-        if abs(flow) < GAIN_HZ * self._facts.slack:  # the goal rests
+        if abs(flow) < min(GAIN_HZ * self._facts.slack, SLOW * self._facts.fastest):  # the goal rests
             left = goal - here - coast
             ends = (
                 self.velocity == 0 or left * coast < 0 < (goal - here) * coast

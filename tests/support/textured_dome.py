@@ -16,6 +16,7 @@ SIZE, WIDE_PX, LONGEST = (320, 240), 300.0, 5.0
 TEXTURE = (4096, 2048)  # of the whole sphere
 LATENCY_S = 0.15  # from light to arrival; the rig's spec says less
 RATE_HZ = 12.5
+SWING_S = 1.2  # period
 
 
 @functools.cache
@@ -47,6 +48,7 @@ class TexturedDome:
         turns_at_zoom: whether a zoom sends the head to 0, 0.
         obeys: whether it goes where it is sent.
         cap_deg_s: highest speed beyond half of the zoom's range.
+        swing_deg: by which it swings about its goal until it is halted.
     """
 
     seed: int = 0
@@ -61,6 +63,8 @@ class TexturedDome:
     turns_at_zoom: bool = False
     obeys: bool = True
     cap_deg_s: float = 100.0
+    swing_deg: float = 0.0
+    swings: bool = False
     t: float = 10.0
 
     def __post_init__(self):
@@ -76,7 +80,8 @@ class TexturedDome:
         return WIDE_PX * LONGEST ** (share + self.curve * share * (1 - share))
 
     def angles(self, t):
-        return [axis.motor(t)[0] for axis in self.axes]
+        swing = math.radians(self.swing_deg) * math.sin(2 * math.pi * t / SWING_S) if self.swings else 0.0
+        return [axis.motor(t)[0] + swing for axis in self.axes]
 
     def picture(self, pan, tilt, focal):
         """What a camera sees."""
@@ -143,7 +148,7 @@ class _Head:
 
     def move(self, pan, tilt, speed=None, wait=False):
         rig, step = self.rig, math.radians(self.rig.round_deg)
-        rig.sent = (pan, tilt)
+        rig.sent, rig.swings = (pan, tilt), True
         for axis, goal, k, rate in zip(rig.axes, (pan, tilt), rig.scale, self.limits.capped(speed), strict=True):
             goal = round(goal / step) * step if step else goal
             if rig.obeys:
@@ -153,5 +158,6 @@ class _Head:
         return pan, tilt
 
     def halt(self):
+        self.rig.swings = False
         for axis in self.rig.axes:
             axis.halt(self.rig.t + self.rig.delay_s + self.rig.stop_s)
