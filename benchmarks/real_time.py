@@ -63,7 +63,7 @@ class RealTimeSettings(Settings):
     in_file: Count = 75
 
 
-def serve(pipe: Connection, frames: int, sent: Any, size: tuple[int, int] = STREAM) -> None:
+def serve(pipe: Connection, frames: int, sent: Any, size: tuple[int, int] = STREAM, carried: Any = None) -> None:
     """Send the film, as both cameras of the server, and emulate the head.
 
     Args:
@@ -72,6 +72,8 @@ def serve(pipe: Connection, frames: int, sent: Any, size: tuple[int, int] = STRE
         sent: gets the time at which each frame from 1 on was published [s], infinite before; the first value is set
             when to begin.
         size: width and height of its frames [px].
+        carried: gets the time at which the sending of each frame to the fixed camera's reader began, if given; a server
+            that is late leaves frames out.
     """
     sys.setswitchinterval(5e-4)  # as in `cotarget emulate`
     images = [frame.image for frame, _ in film(size, LENGTH, 0)]
@@ -82,16 +84,26 @@ def serve(pipe: Connection, frames: int, sent: Any, size: tuple[int, int] = STRE
             encoded[id(image)] = encode_jpeg(image, quality, size)
         return encoded[id(image)]
 
+    def publish(index: int, t: float) -> None:
+        image = images[ORDER[index % len(ORDER)]]
+        feed.publish(Picture(image, index, t))
+        zoom_feed.publish(Picture(image, index + frames + 1, t))
+
     pan, tilt = (EmulatedAxis(Axis(STEPS_S, 1.0), WallClock(), 1.0, 0.0) for _ in range(2))
-    feed, ports = Feed(), UnitPorts(D46(pan, tilt, D46_STOCK, Faults(D46_FAULTS), time.monotonic))
+
+    def note(index: int, t: float) -> None:
+        if carried is not None and index <= frames:
+            carried[index] = t
+
+    feed, zoom_feed, ports = Feed(), Feed(), UnitPorts(D46(pan, tilt, D46_STOCK, Faults(D46_FAULTS), time.monotonic))
     try:
         with (
             mock.patch.object(axis_241q, "encode_jpeg", once),
-            axis_241q.AxisServer({1: feed, 2: feed}, quality=QUALITY) as server,
+            axis_241q.AxisServer({1: feed, 2: zoom_feed}, quality=QUALITY, sent=note) as server,
         ):
             for image in images:
                 once(image, QUALITY)
-            feed.publish(Picture(images[0], 0, time.monotonic()))
+            publish(0, time.monotonic())
             pipe.send((server.url, ports.port))
             while not sent[0]:  # the other side has not connected yet
                 if pipe.poll(WAIT_S):
@@ -101,7 +113,7 @@ def serve(pipe: Connection, frames: int, sent: Any, size: tuple[int, int] = STRE
                 if pipe.poll(max(begun + index / RATE_HZ - time.monotonic(), 0.0)):
                     return
                 sent[index] = time.monotonic()
-                feed.publish(Picture(images[ORDER[index % len(ORDER)]], index, sent[index]))
+                publish(index, sent[index])
             pipe.recv()
     finally:
         ports.close()
