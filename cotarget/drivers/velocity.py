@@ -71,7 +71,8 @@ class SteeredAxis:
     """Velocities that lead an axis to its goal, and along with goals that move.
 
     The position is predicted from the newest one that the device has said and the velocities sent since. An axis that
-    turns on after a stop is stopped as much earlier. One that goes beyond a goal at rest all the same, again and again,
+    turns on after a stop is stopped as much earlier where its goal rests; on the way with a goal that moves, another
+    velocity takes the place of a stop. One that goes beyond a goal at rest all the same, again and again,
     such as by its lowest speed, gets a wider tolerance for a while.
 
     Args:
@@ -85,6 +86,7 @@ class SteeredAxis:
         self._sent = deque([(0.0, 0.0)], maxlen=100)  # (time, velocity)
         self._goal: float | None = None
         self._limit, self._flow, self._aimed = facts.fastest, 0.0, -FLOW_S
+        self._slow = min(GAIN_HZ * facts.slack, SLOW * facts.fastest)
         self._tolerance = self._least = max(facts.slack / 2, facts.same)
         self._swings = 0  # times that it has gone beyond the goal of now
         self._turned = 0.0  # the velocity with which it last began to go to the goal of now
@@ -127,14 +129,14 @@ class SteeredAxis:
             goal, flow = min(max(goal, self._facts.lowest), self._facts.highest), 0.0
         here, coast = self._predicted(position, t, now)
         gain = GAIN_HZ
-        if abs(flow) < min(GAIN_HZ * self._facts.slack, SLOW * self._facts.fastest):  # the goal rests
+        if not flow:
             left = goal - here - coast
-            ends = (
-                self.velocity == 0 or left * coast < 0 < (goal - here) * coast
-            )  # it stands, turns on, or goes too far
-            if abs(left) <= self._tolerance or (coast and ends):
+            passes = left * coast < 0 < (goal - here) * coast
+            if abs(left) <= self._tolerance or (coast and (self.velocity == 0 or passes)):
                 return 0.0
             gain = 1 / (1 / GAIN_HZ + self._stop_delay)
+        elif abs(goal - here) <= self._tolerance and abs(flow) < self._slow:
+            return 0.0
         wanted = min(max(flow + gain * (goal - here), -self._limit), self._limit)
         beyond = abs(goal - position)
         if not flow and wanted * self._turned < 0 and beyond > self._facts.slack:
