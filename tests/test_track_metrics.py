@@ -479,7 +479,7 @@ def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):
 def test_a_track_of_a_replay_ends_at_the_images_border_as_labels_do():
     """Of a box of 10x6 px at the left border, 4 columns are outside."""
     frame = Frame(np.zeros((48, 64, 3), np.uint8), 1.5)
-    near = SimpleNamespace(reported=True, id=3, center_px=np.array([0.5, 20.5]), size_px=np.array([10.0, 6.0]))
+    near = SimpleNamespace(reported=True, id=3, center_px=np.array([0.5, 20.5]), whole_px=np.array([10.0, 6.0]))
     replayed = TracksByImage({1.5: 7})
     replayed.see(SimpleNamespace(fixed=frame, tracks=[near]))
     (found,) = replayed.tracks

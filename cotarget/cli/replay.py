@@ -102,7 +102,7 @@ class TracksByImage:
         frame = self._numbers[step.fixed.t]
         height, width = step.fixed.image.shape[:2]
         self.tracks += [
-            Tracked(*within_image(each.center_px, each.size_px, (width, height)), frame, step.fixed.t, each.id)
+            Tracked(*within_image(each.center_px, each.whole_px, (width, height)), frame, step.fixed.t, each.id)
             for each in step.tracks
             if each.reported
         ]

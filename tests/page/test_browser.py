@@ -23,7 +23,7 @@ pytestmark = [
     pytest.mark.skipif(find() is None, reason="Chromium is not installed: apt-get install chromium"),
 ]
 STOP = ("stop", "stopped from the page")
-TRACK = SimpleNamespace(id=7, center_px=np.array([100.0, 60.0]), size_px=np.array([40.0, 30.0]), reported=True)
+TRACK = SimpleNamespace(id=7, center_px=np.array([100.0, 60.0]), whole_px=np.array([40.0, 30.0]), reported=True)
 SHIFT = 8  # modifier of a key
 PLACE_PX = 2.0  # of a click, by the rounding of the layout
 TEXT, LARGE = 4.5, 3.0  # contrast of WCAG AA: of text, of large text and of what surrounds controls

@@ -54,8 +54,8 @@ def test_a_browser_that_reads_nothing_delays_nobody(at):
 
 def test_a_picture_says_what_is_shown():
     tracks = (
-        SimpleNamespace(id=7, center_px=np.array([100.0, 50.04]), size_px=np.array([9.0, 8.0]), reported=True),
-        SimpleNamespace(id=8, center_px=np.array([10.0, 5.0]), size_px=np.array([9.0, 8.0]), reported=False),
+        SimpleNamespace(id=7, center_px=np.array([100.0, 50.04]), whole_px=np.array([9.0, 8.0]), reported=True),
+        SimpleNamespace(id=8, center_px=np.array([10.0, 5.0]), whole_px=np.array([9.0, 8.0]), reported=False),
     )
     covariance = np.array([[25.0, 0.0], [0.0, 4.0]])
     seen = SimpleNamespace(covariance=covariance, offset_px=np.array([10.0, -5.0]), size_px=80.0)

@@ -26,7 +26,7 @@ STEPS = 60  # of the run
 CODED = 6  # error of the film's coding [grey levels]: steps that differ by less are 13 or more steps apart, see `shade`
 LATE, LATE_S = 30, 2.0  # a step that comes late
 BEFORE_S = 1000.0  # the clock's time when the run begins
-TRACK = SimpleNamespace(id=7, center_px=np.array([100.0, 60.0]), size_px=np.array([40.0, 30.0]), reported=True)
+TRACK = SimpleNamespace(id=7, center_px=np.array([100.0, 60.0]), whole_px=np.array([40.0, 30.0]), reported=True)
 
 
 def at_s(n):
