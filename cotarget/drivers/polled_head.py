@@ -84,7 +84,9 @@ TRIES = 3  # of a move, and of polls in a row, that end because the unit was sil
 PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
 # A unit that reports no position for this time [s] and in so many polls is dead; a program may have been suspended.
 UNHEARD_S, UNHEARD_POLLS = 5.0, 10
-STRANGE_RAD = math.radians(0.5)  # turned without a command, beyond the slack: another program moves the unit
+# A unit may obey late: a head that has stood for so long since the last command [s], and turns by this angle beyond its
+# slack, is moved by another program.
+OBEYED_S, STRANGE_RAD = 1.0, math.radians(0.5)
 LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: a unit may answer only when it stands [s]
 
 
@@ -144,7 +146,8 @@ class Loop:
         self._has_moved = False  # whether a move was sent since the last zoom
         self._cuts = 0  # in a row, without a poll between them
         self._active: Move | None = None
-        self._rest: tuple[float, ...] | None = None  # where the head stands since the last command
+        self._rest: tuple[float, ...] | None = None  # where the head stands, and has stood for `OBEYED_S`
+        self._told_t = -math.inf  # when something was last commanded [s]
         self._speeds: Pair = (0.0, 0.0)  # of the last move
         self.requests = Requests()
         self.halted = 0  # number of the newest halt that was taken out of the queue
@@ -279,7 +282,7 @@ class Loop:
         if self._active is not None or any(track.newest.sigma for track in self._head):
             return
         if self._rest is None:
-            if self._stand(self._head):
+            if self._stand(self._head) and self._clock.now() - self._told_t > OBEYED_S:
                 self._rest = tuple(track.newest.position for track in self._head)
             return
         turned = max(
@@ -295,7 +298,7 @@ class Loop:
 
     def _expect_motion(self, tracks: Sequence[AxisTrack]) -> None:
         if tracks is self._head:
-            self._rest = None
+            self._rest, self._told_t = None, self._clock.now()
         for track in tracks:
             track.expect_motion(self._clock.now() + self._delay)
 

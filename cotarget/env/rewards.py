@@ -6,7 +6,6 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.config import GOOD_SIZE
 from cotarget.control.policy import ZOOM_UNIT
 from cotarget.geometry import Array
 from cotarget.metrics import Closeup
@@ -16,14 +15,14 @@ REWARDS: tuple[Reward, ...] = get_args(Reward)
 
 
 def closeness(off: npt.ArrayLike, size_ratio: npt.ArrayLike) -> Array:
-    """How near a close-up is to a centred target of the wanted size, 0 to 1.
+    """How near a close-up is to a centred target of the wanted size, 0 to 1; half for one of twice or half that size.
 
     Args:
         off: distance of the target from the image's centre in half-widths of the close-up; infinite behind the camera.
         size_ratio: size over the wanted size; 0 behind the camera.
     """
     with np.errstate(divide="ignore"):
-        wrong_size = np.abs(np.log(size_ratio)) / np.log(GOOD_SIZE[1])
+        wrong_size = np.abs(np.log2(size_ratio))
     return 1 / ((1 + np.asarray(off)) * (1 + wrong_size))
 
 

@@ -16,6 +16,7 @@ from cotarget.config import SafetyConfig, parse_config
 from cotarget.drivers import onvif
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.onvif import OnvifDevice, OnvifDome, OnvifLink
+from cotarget.drivers.polled_head import OBEYED_S
 from cotarget.drivers.rig import device_of, devices
 from cotarget.emulators.onvif import ANSWERS, PAN_TILT, TPTZ, TRT, OnvifCamera, SoapFault
 from cotarget.errors import ConfigError, CotargetError, DeviceError
@@ -116,7 +117,7 @@ def test_a_head_that_another_program_moves_is_reported_once_and_left_alone(caplo
     with OnvifUnit() as unit, opened(unit) as dome:
         dome.head.move(math.radians(10.0), 0.0, wait=True)
         sent = list(unit.moves)
-        time.sleep(SETTLED_S)
+        time.sleep(OBEYED_S + SETTLED_S)
         unit.pan.command(round(40.0 / STEP_DEG), 20.0 / STEP_DEG, 1e6)
         wait_for(lambda: "turns without a command" in caplog.text, NOTICED_S)
         wait_for(lambda: unit.pan.degrees() == pytest.approx(40.0))

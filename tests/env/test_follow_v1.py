@@ -137,8 +137,8 @@ def test_absolute_actions_and_yield_do_what_they_do_in_version_0(field):
 def test_closeness_is_1_for_a_centred_target_of_the_wanted_size_and_falls_to_0():
     assert closeness(0.0, 1.0) == 1.0
     assert closeness(1.0, 1.0) == 0.5
-    assert closeness(0.0, 1.25) == pytest.approx(0.5)
-    assert closeness(0.0, 0.8) == pytest.approx(0.5)
+    assert closeness(0.0, 2.0) == pytest.approx(0.5)
+    assert closeness(0.0, 0.25) == pytest.approx(1 / 3)
     assert closeness(math.inf, 1.0) == closeness(0.0, 0.0) == 0.0
 
 
