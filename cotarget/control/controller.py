@@ -199,6 +199,7 @@ class Controller:
             ((then.pan - first.pan) / interval, (then.tilt - first.tilt) / interval),
             self._rig.zoom.size[0] / self._true(focal),
             self._lead(predict, effect_t, target),
+            effect_t - target.measured_t,
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)

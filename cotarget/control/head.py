@@ -262,6 +262,7 @@ class HeadController:
         rates: Angles,
         field: float,
         lead: Angles = (0.0, 0.0),
+        lead_s: float = 0.0,
     ) -> HeadCommand | None:
         """Decide on a command for the head.
 
@@ -271,14 +272,15 @@ class HeadController:
             wanted: wanted pan and tilt at ``effect_t`` [rad].
             rates: rates of these [rad/s].
             field: horizontal angle of view [rad].
-            lead: way of ``wanted`` from the last measurement to ``effect_t`` [rad]; a slow axis does not lead by all of
-                it.
+            lead: way of ``wanted`` from the last measurement to ``effect_t`` [rad]; a head does not lead a target that
+                stands.
+            lead_s: time of that way [s]; an axis that is slow while the other turns does not lead by all of it.
 
         Returns:
             The command; None if the head is best left alone.
         """
         zone = max(self._settings.zone * field, *(axis.step for axis in self._limits.axes))
-        reference = self._damped(wanted, rates, zone, lead)
+        reference = self._damped(wanted, rates, zone, lead, lead_s)
         resting = (
             self._axes_at_rest(effect_t, interval_s, reference, zone) if self._settings.deadband else [False, False]
         )
@@ -315,13 +317,13 @@ class HeadController:
         self.head.add_command(effect_t, command)
         return command
 
-    def _damped(self, wanted: Angles, rates: Angles, zone: float, lead: Angles) -> _Reference:
+    def _damped(self, wanted: Angles, rates: Angles, zone: float, lead: Angles, lead_s: float) -> _Reference:
         """Remove speed and lead from slow axes, where they are mostly noise."""
         limit = self._settings.slow * zone
         slow = tuple(abs(rate) * scale <= limit for rate, scale in zip(rates, _scales(wanted[1]), strict=True))
         still = _angle_between(rates, (0.0, 0.0), wanted[1]) <= limit / 2
-        part = 1.0 if still else self._settings.slow_lead
-        pan, tilt = (q - part * way if at_rest else q for q, way, at_rest in zip(wanted, lead, slow, strict=True))
+        left_out = lead if still else [self._settings.slow_lead * lead_s * rate for rate in rates]
+        pan, tilt = (q - way if at_rest else q for q, way, at_rest in zip(wanted, left_out, slow, strict=True))
         pan_rate, tilt_rate = (0.0 if at_rest else rate for rate, at_rest in zip(rates, slow, strict=True))
         return _Reference((pan, tilt), (pan_rate, tilt_rate), (slow[0], slow[1]), still)
 
