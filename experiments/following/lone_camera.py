@@ -237,8 +237,9 @@ class LoneCamera:
         wanted, _ = course.at(effect)
         true_px = self._zoom.at(self._focal).focal_px[0]
         field = rig.zoom.size[0] / true_px
-        pan, tilt = ((effect - course.seen_t) * rate for rate in course.rates)
-        command = self._head_controller.decide(effect, interval, wanted, course.rates, field, (pan, tilt))
+        lead_s = effect - course.seen_t
+        lead = lead_s * course.rates[0], lead_s * course.rates[1]
+        command = self._head_controller.decide(effect, interval, wanted, course.rates, field, lead, lead_s)
         if command is not None:
             rig.head.move(command.pan, command.tilt, command.speed)
         exposed = effect + interval
