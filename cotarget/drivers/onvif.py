@@ -73,6 +73,7 @@ TIMEOUT_S = 1.0  # a continuous move ends by itself after this time, where the d
 WORKERS = 8  # commands that may be under way at the same time
 FINE = 0.02  # velocities are sent again where they change by more, as a share of the highest
 ZOOM_STEPS = 1000  # in which the range of the zoom's number is divided
+OUTSIDE_DEG = 5.0  # this far beyond the device's own range, a position is lost
 ZOOM_SLACK = 0.01  # of that range, by which the reported number may be off
 
 
@@ -546,6 +547,7 @@ class OnvifLink(PtzLink):
             self._way = self._refuse_unable(status)
             self._coordinates = self._find_coordinates(status)
             self.axes = self._find_axes()
+            self._refuse_lost(status)
             self._reckoned = [ReckonedAxis(facts, settings.command_delay_s) for facts in self.axes]
             delays = settings.command_delay_s, settings.stop_delay_s
             self._steered = [SteeredAxis(facts, *delays) for facts in self.axes[:2]]
@@ -567,6 +569,7 @@ class OnvifLink(PtzLink):
         """Take the newest positions, and reckon those that the device does not say; steer an axis on its way."""
         status, now = self._reader.take(), self._clock.now()
         if status is not None:
+            self._refuse_lost(status)
             self._blocks |= now - self._heard > BLIND_S
             self._heard, self._seen = now, status
         elif now - self._heard < BLIND_S:
@@ -742,6 +745,16 @@ class OnvifLink(PtzLink):
                 reckoned.correct(position, status.t)
                 polls.append(Poll(i, position, status.t))
         return polls
+
+    def _refuse_lost(self, status: Status) -> None:
+        """Raise where a position is outside of the device's own range: to steer by it would lead to an end."""
+        for word, position, axis in zip(("pan", "tilt"), self._positions(status), self.axes, strict=False):
+            lowest, highest = axis.lowest - OUTSIDE_DEG, axis.highest + OUTSIDE_DEG
+            if position is not None and not lowest <= position <= highest:
+                raise DeviceError(
+                    f"{self._who} says that its {word} is at {position:.1f} degrees, outside of its own range from "
+                    f"{axis.lowest:g} to {axis.highest:g}: its position is lost; switch it off and on"
+                )
 
     def _refuse_silence(self, axis: int, now: float) -> None:
         """Raise where an axis says no position any more, though it should stand, and no status was late before."""

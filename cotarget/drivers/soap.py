@@ -309,7 +309,7 @@ class SoapClient:
             if len(said) > LONGEST_ANSWER:
                 raise DeviceError(f"{self.name} answers {message} without end: check host and port")
             if time.monotonic() > deadline:
-                raise SilentError(f"{self.name} did not answer {message} in time")
+                raise SilentError(f"{self.name} did not answer {message} in time: check its power and the network")
         return bytes(said)
 
     @contextlib.contextmanager
@@ -321,9 +321,13 @@ class SoapClient:
             raise DeviceError(f"{self.name} does not answer: check host and port, its power and the network") from None
         except httpx.ConnectError as error:
             why = _root_of(error)
-            raise DeviceError(f"{self.name} cannot be reached ({why}): check host and port, its power") from None
+            raise DeviceError(
+                f"{self.name} cannot be reached ({why}): check host and port, its power and the network"
+            ) from None
         except httpx.TimeoutException:
-            raise SilentError(f"{self.name} did not answer {message} in time") from None
+            raise SilentError(
+                f"{self.name} did not answer {message} in time: check its power and the network"
+            ) from None
         except (httpx.HTTPError, httpx.InvalidURL, httpx.StreamError, RuntimeError) as error:
             why = quote(str(error)) or type(error).__name__
             raise SilentError(f"{self.name} broke off at {message} ({why}): check host and port") from None

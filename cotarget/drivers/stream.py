@@ -477,7 +477,9 @@ class StreamCamera(BufferedCamera):
             case errors.HTTPNotFoundError():
                 return StreamRefusedError(f"{name} has no such stream (404): check the path in its url")
             case errors.HTTPServerError():
-                return BusyError(f"{name} is busy, perhaps with too many viewers: close some, or restart it")
+                return BusyError(
+                    f"{name} is busy or fails, perhaps with too many viewers: close some, restart it, or check its url"
+                )
             case errors.HTTPClientError():
                 return StreamRefusedError(f"{name} refuses the stream ({why}): check its url")
             case errors.ExitError() | TimeoutError():

@@ -57,11 +57,13 @@ ONVIF_PROFILES = (
     "blocking-status",  # it answers when the move has ended
     "always-moving",
     "boolean-status",  # MoveStatus is true or false
+    "position-lost",  # the status has a pan outside of its range
     # Coordinates
     "pan-reversed",
     "tilt-reversed",
     "wide-ranges",  # 0 to 360 and 0 to 180 in place of -1 to 1
     "degrees",  # in the space of degrees
+    "endless-pan",  # its numbers are a whole turn from its lowest position on; it goes the shorter way
     "no-zoom",  # the zoom's lowest number is its highest
     # Users, clocks, addresses
     "clock-20s",  # it is ahead by so much, and takes tokens within 5 s
@@ -119,6 +121,8 @@ BLOCKS_S = 30.0  # longest time that a status blocks [s]
 LONGEST_TIMEOUT_S = {True: 10.0, False: 600.0}  # by whether it is clamped
 DEFAULT_TIMEOUT_S = 5.0
 LOWEST_DEG_S = 1.5
+TURN_DEG = 360.0
+LOST = 0.55  # by which the number of a lost position is too large, as a share of the range: 557.4 of 360 degrees
 # Highest speed by the share of the zoom's range in its logarithm, of domes that limit it [degrees/s].
 CAPS = ((0.2, math.inf), (0.4, 30.0), (0.6, 7.85), (0.8, 4.5), (1.0, 1.5))
 # Numbers and magnifications of a zoom block of 25 x, as shares of the range.
@@ -222,8 +226,14 @@ class OnvifCamera:
     def numbers(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Ranges of the numbers of pan and tilt."""
         if "degrees" in self._faults:
-            return self.model.pan_deg, self.model.tilt_deg
+            return self.ranges_deg
         return ((0.0, 360.0), (0.0, 180.0)) if "wide-ranges" in self._faults else ((-1.0, 1.0), (-1.0, 1.0))
+
+    @property
+    def ranges_deg(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Lowest and highest position of pan and tilt."""
+        low, high = self.model.pan_deg
+        return (low, low + TURN_DEG if "endless-pan" in self._faults else high), self.model.tilt_deg
 
     @property
     def space(self) -> str:
@@ -239,14 +249,18 @@ class OnvifCamera:
         """Return pan, tilt and zoom in the device's numbers."""
         found = []
         reversed_ = ("pan-reversed" in self._faults, "tilt-reversed" in self._faults)
-        ranges = (self.model.pan_deg, self.model.tilt_deg)
-        for axis, (low, high), (a, b), backward in zip(self._axes, ranges, self.numbers(), reversed_, strict=True):
+        lost = LOST if "position-lost" in self._faults else 0.0
+        for axis, (low, high), (a, b), backward in zip(
+            self._axes, self.ranges_deg, self.numbers(), reversed_, strict=True
+        ):
             share = (axis.position() * self.model.step_deg - low) / (high - low)
+            share = share % 1.0 if "endless-pan" in self._faults and axis is self._axes[0] else share
             number = a + (b - a) * (1.0 - share if backward else share)
             width = (b - a) / 2
             found.append(round(number / width, 2) * width if "rounded" in self._faults else number)
         share = _interpolated(self._lens.position() / self._lens.last, [(y, x) for x, y in SHARES])
-        return found[0], found[1], share
+        (a, b), _ = self.numbers()
+        return found[0] + lost * (b - a), found[1], share
 
     def moving(self) -> bool:
         """Return whether pan or tilt moves."""
@@ -284,14 +298,18 @@ class OnvifCamera:
         return abs(pan - at[0]) > 1e-3 and abs(tilt - at[1]) > 1e-3
 
     def _steps(self, i: int, number: float) -> int:
-        low, high = (self.model.pan_deg, self.model.tilt_deg)[i]
+        """Convert a number to the position of an axis [steps]; of those of an endless one, to the nearest."""
+        low, high = self.ranges_deg[i]
         a, b = self.numbers()[i]
         if "rounded" in self._faults:
             number = round(number / ((b - a) / 2), 2) * (b - a) / 2
         share = (number - a) / (b - a)
         if ("pan-reversed", "tilt-reversed")[i] in self._faults:
             share = 1.0 - share
-        return round((low + share * (high - low)) / self.model.step_deg)
+        goal_deg = low + share * (high - low)
+        if i == 0 and "endless-pan" in self._faults:
+            goal_deg += TURN_DEG * round((self._axes[0].position() * self.model.step_deg - goal_deg) / TURN_DEG)
+        return round(goal_deg / self.model.step_deg)
 
     def drive(self, pan: float | None, tilt: float | None, zoom: float | None, timeout_s: float | None) -> None:
         """Turn at velocities, as shares of the highest; one of zero stops."""
@@ -312,7 +330,9 @@ class OnvifCamera:
                 if share == 0:
                     axis.halt(self._acceleration)
                     continue
-                low, high = (self.model.pan_deg, self.model.tilt_deg)[i]
+                low, high = self.ranges_deg[i]
+                if i == 0 and "endless-pan" in self._faults:
+                    low, high = (round(axis.position() * self.model.step_deg) + side * TURN_DEG for side in (-1, 1))
                 backward = ("pan-reversed", "tilt-reversed")[i] in self._faults
                 end = high if (share > 0) != backward else low
                 speed = fastest if "signs-only" in self._faults else min(abs(share), 1.0) * fastest
@@ -645,9 +665,7 @@ def _relative(camera: OnvifCamera, faults: Faults, message: Message) -> str:
     if in_degrees and "relative-degrees" not in faults:
         raise SoapFault("no such space", "InvalidArgVal", "SpaceNotSupported")
     goals = []
-    for way, here, (low, high), ends in zip(
-        (pan, tilt), at[:2], numbers, (camera.model.pan_deg, camera.model.tilt_deg), strict=True
-    ):
+    for way, here, (low, high), ends in zip((pan, tilt), at[:2], numbers, camera.ranges_deg, strict=True):
         width = ends[1] - ends[0] if in_degrees else 2.0
         goals.append(None if way is None else min(max(here + way * (high - low) / width, low), high))
     camera.go(goals, None if zoom is None else min(max(at[2] + zoom, 0.0), 1.0), None)

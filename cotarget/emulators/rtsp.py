@@ -109,6 +109,8 @@ def split_nals(data: bytes) -> tuple[bytes, ...]:
 
 ENDLESS = 1_000_000  # pictures in a group
 LONG_GROUP_S = 10.0
+B_FRAMES = 2
+BLUR_PX = 8.0
 CHECK_S = 0.1  # period with which waiting threads check for the end [s]
 
 
@@ -121,7 +123,6 @@ class Encoder(Closes):
         rate_hz: nominal rate of the pictures.
         group_s: time from one key frame to the next [s].
         crf: x264's quality; less is finer.
-        b_frames: largest number of B-frames in a row.
         faults: of `RTSP_FAULTS`.
     """
 
@@ -133,12 +134,11 @@ class Encoder(Closes):
         *,
         group_s: float = 1.0,
         crf: int = 18,
-        b_frames: int = 0,
         faults: Faults,
     ) -> None:
         self._feed, self._stream, self._faults = feed, stream, faults
         self._rate_hz, self._group = rate_hz, max(round(group_s * rate_hz), 1)
-        self._crf, self._b_frames = crf, b_frames
+        self._crf = crf
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="encoder", daemon=True)
         self._thread.start()
@@ -158,10 +158,13 @@ class Encoder(Closes):
             last = picture.index
             shown = shown if "frozen" in self._faults and shown is not None else picture.image
             image = self._turned(half(shown) if "resolution" in self._faults else shown)
+            image = cv2.GaussianBlur(image, None, BLUR_PX) if "blurred" in self._faults else image
             group = ENDLESS if "no-key" in self._faults else self._group
             group = round(LONG_GROUP_S * self._rate_hz) if "long-groups" in self._faults else group
-            if context is None or (context.width, context.height, context.gop_size) != (*image.shape[1::-1], group):
-                context = self._encoder(image.shape[1], image.shape[0], group)
+            b_frames = B_FRAMES if "b-frames" in self._faults else 0
+            kind = (*image.shape[1::-1], group, b_frames)
+            if context is None or kind != (context.width, context.height, context.gop_size, context.max_b_frames):
+                context = self._encoder(*kind)
             frame = av.VideoFrame.from_ndarray(image, format="bgr24").reformat(format="yuv420p")
             frame.time_base, frame.pts = context.time_base, round((picture.t - begin) * TICKS_HZ)
             for packet in context.encode(frame):
@@ -174,15 +177,15 @@ class Encoder(Closes):
         image = image[::-1, ::-1] if "upside-down" in self._faults else image
         return np.ascontiguousarray(image[:, ::-1] if "mirrored" in self._faults else image)
 
-    def _encoder(self, width: int, height: int, group: int) -> av.CodecContext:
+    def _encoder(self, width: int, height: int, group: int, b_frames: int) -> av.CodecContext:
         context = av.CodecContext.create("libx264", "w")
         context.width, context.height, context.pix_fmt = width, height, "yuv420p"
         context.time_base = Fraction(1, TICKS_HZ)
         context.framerate = Fraction(self._rate_hz).limit_denominator(1000)
-        context.gop_size, context.max_b_frames = group, self._b_frames
+        context.gop_size, context.max_b_frames = group, b_frames
         context.thread_count = 1  # the other core is the client's
         context.options = {"preset": "ultrafast", "crf": f"{self._crf}"}
-        if not self._b_frames:
+        if not b_frames:
             context.options |= {"tune": "zerolatency"}
         return context
 
@@ -265,6 +268,10 @@ RTSP_FAULTS = (
     "corrupt",  # bytes of every picture are destroyed
     "no-key",  # one key frame, and then no more
     "long-groups",  # a key frame every 10 s
+    "b-frames",  # up to two in a row
+    "jitter",  # pictures arrive up to 0.14 s late
+    "sessions-end",  # each after a minute
+    "blurred",  # the lens is out of focus
     "upside-down",  # the picture is turned by half a turn
     "mirrored",  # left and right of the picture are exchanged
     "frozen",  # the same image is sent at its rate
@@ -283,6 +290,8 @@ SESSION_S = 60  # a client that sends nothing for this time has gone [s]
 SEND_S = 5  # a client that takes nothing for this time is disconnected [s]
 REPORT_S = 5.0  # period of sender reports [s]
 FIRST_PICTURE_S = 5.0  # time limit for a camera's first picture [s]
+SHORT_SESSION_S = 60.0  # of a camera that ends each
+JITTER_S = (0.0, 0.02, 0.14, 0.0, 0.06, 0.09, 0.0)  # of one picture after the other: 0.05 s rms
 REASONS = {
     200: "OK", 400: "Bad Request", 401: "Unauthorized", 404: "Not Found", 453: "Not Enough Bandwidth",
     454: "Session Not Found", 455: "Method Not Valid in This State", 461: "Unsupported Transport",
@@ -534,14 +543,18 @@ class Session:
 
     def _send_pictures(self) -> None:
         """Send pictures until the client stops them, has gone, or takes nothing any more."""
-        last, reported = -1, -math.inf
+        last, reported, begin = -1, -math.inf, time.monotonic()
         try:
             while not self._ended.is_set() and not self._server.is_refused():
+                if "sessions-end" in self._faults and time.monotonic() > begin + SHORT_SESSION_S:
+                    break
                 unit = self._server.stream.after(last, CHECK_S)
                 if unit is None or "stall" in self._faults:
                     self._ended.wait(CHECK_S if unit is not None else 0.0)
                     continue
                 last = unit.index
+                if "jitter" in self._faults:
+                    self._ended.wait(JITTER_S[last % len(JITTER_S)])
                 self._send_picture(unit)
                 now = time.monotonic()
                 if now - reported >= REPORT_S:

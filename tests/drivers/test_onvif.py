@@ -436,6 +436,28 @@ def test_a_device_that_takes_velocities_is_steered_to_its_goal(profiles):
         assert unit.pan.degrees() < 80.0
 
 
+def test_a_steered_dome_that_loses_its_position_is_stopped_and_named():
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        dome.head.move(math.radians(60.0), 0.0, speed=math.radians(40.0))
+        wait_for(lambda: unit.pan.degrees() > 5.0)
+        unit.faults.set("position-lost")
+        assert "outside of its own range from -150 to 170: its position is lost" in fails(dome.head.state)
+        time.sleep(SETTLED_S)
+        assert not unit.turning()
+        assert 5.0 < unit.pan.degrees() < 60.0
+
+
+@pytest.mark.parametrize("profile", ["endless-pan", "continuous-only,endless-pan"])
+def test_a_dome_without_an_end_of_pan_goes_across_the_end_of_its_numbers(profile):
+    """They end at 210 degrees, which are -150: from 200 to -145 is 15 degrees or 345."""
+    with OnvifUnit(*profile.split(",")) as unit, opened(unit, pan_deg=(-150.0, 210.0)) as dome:
+        unit.pan.command(round(200.0 / STEP_DEG), 1e6, 1e9)
+        wait_for(lambda: math.degrees(dome.head.state().pan) == pytest.approx(200.0, abs=NEAR_DEG))
+        dome.head.move(math.radians(-145.0), 0.0, wait=True)
+        wait_for(lambda: not unit.turning())
+        assert unit.pan.degrees() % 360.0 == pytest.approx(215.0, abs=unit.settings.slack_deg + NEAR_DEG)
+
+
 def test_a_steered_device_goes_on_beyond_its_default_timeout(monkeypatch):
     """At 10 degrees/s, 15 degrees take longer than the timeout of one second."""
     with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
@@ -585,6 +607,7 @@ def test_a_table_outside_of_the_devices_range_is_refused_and_nothing_stays_open(
     ("presets-only", "has neither absolute moves nor velocities, only presets: it is not driven"),
     ("continuous-only,no-status", "can only be moved by velocities, and does not say where it is: it is not driven"),
     ("no-zoom", "says that zoom goes from 1 to 1"),
+    ("position-lost", r"its pan is at 176.0 degrees, outside of its own range from -150 to 170: its position is lost"),
     ("unauthorized", "not for the user 'root': check hardware.ptz.user and the password"),
     ("silence", "did not answer GetSystemDateAndTime in time"), ("refuse", "broke off|cannot be reached"),
     ("garbage", "no SOAP"), ("half-answers", "broke off"), ("not-soap", "no SOAP"), ("bomb", "it has a document type"),

@@ -275,8 +275,10 @@ def draw(index):
 
 
 @contextlib.contextmanager
-def filmed(**options):
+def filmed(profiles=(), **options):
     faults = Faults(RTSP_FAULTS)
+    for name in profiles:
+        faults.set(name)
     with (
         Film(draw, 1 / RATE_HZ) as film,
         contextlib.closing(Encoder(film.feed, stream := EncodedStream(), RATE_HZ, faults=faults)),
@@ -440,17 +442,42 @@ def test_a_client_that_reads_nothing_delays_no_other_one_and_is_disconnected(mon
 
 @wire
 def test_pictures_with_b_frames_arrive_in_order():
-    faults = Faults(RTSP_FAULTS)
-    with (
-        Film(draw, 1 / RATE_HZ) as film,
-        contextlib.closing(Encoder(film.feed, stream := EncodedStream(), RATE_HZ, b_frames=2, faults=faults)),
-        RtspServer(stream) as server,
-        opened(server) as camera,
-    ):
+    with filmed(("b-frames",)) as server, opened(server) as camera:
         times = [camera.read(timeout=PATIENCE_S).t]
         while len(times) < 20:
             times.append(camera.read(times[-1], PATIENCE_S).t)
     assert np.median(np.diff(times)) == pytest.approx(1 / RATE_HZ, rel=0.5)
+
+
+@wire
+def test_a_networks_jitter_moves_no_time_of_a_picture():
+    """Pictures come up to 0.14 s late, three times their period."""
+    with filmed(("jitter",)) as server, opened(server) as camera:
+        frames = [camera.read(timeout=PATIENCE_S)]
+        while len(frames) < 40:
+            frames.append(camera.read(frames[-1].t, PATIENCE_S))
+    lefts = [np.argmax(frame.image[120, :, 1] > 130) - 10 for frame in frames[20:]]
+    delays = [frame.t - DRAWN[left] for left, frame in zip(lefts, frames[20:], strict=True)]
+    assert np.std(delays) < SPREAD_S
+
+
+@wire
+def test_a_stream_that_ends_again_and_again_goes_on(monkeypatch):
+    monkeypatch.setattr(rtsp, "SHORT_SESSION_S", 0.5)
+    with filmed(("sessions-end",)) as server, opened(server) as camera:
+        begin = camera.read(timeout=PATIENCE_S).t
+        for passed in (1.5, 3.0):
+            wait_for(lambda passed=passed: comes(camera, begin + passed))
+
+
+@wire
+def test_a_picture_out_of_focus_has_no_edges():
+    with filmed() as server, opened(server) as camera:
+        sharp = camera.read(timeout=PATIENCE_S)
+        server.faults.set("blurred")
+        frame = camera.read(sharp.t + 1.0, PATIENCE_S)
+    steepest = [np.abs(np.diff(each.image[120, :, 1].astype(int))).max() for each in (sharp, frame)]
+    assert steepest[1] < steepest[0] / 4
 
 
 @wire
