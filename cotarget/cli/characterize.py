@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # The picture shows scales to 1 %, to 2 % where it has 320 px, and the focal length to 4 %. What rig.toml has stays
 # where it is as near: it is from the data sheet.
-SAME_SCALE, SAME_FOCAL, SCALE_PX = 0.015, 0.05, 640
+SAME_SCALE, SAME_FOCAL, SCALE_PX = 0.01, 0.05, 640
 SURE_DEG = 0.2  # rms angle beyond which positions are not where the picture shows
 SHARE = 1.3  # of the largest distance from the goal that was seen: the next may be larger
 SAME_STOP_S = 0.1  # stops are measured to 0.03 s

@@ -9,6 +9,7 @@
 - parity: final pose of the head, the simulation opened directly and over the wire.
 - follow: close-up yield of a person who is followed through a dome that deviates from its standard in a known way, over
   that of the simulation with the same rates.
+- characterize: what `cotarget characterize` finds of domes drawn by seed, against the truth.
 
 All run in real time beside the emulator, which needs its own core. On a busy machine the figures include its load.
 """
@@ -28,7 +29,7 @@ from cotarget.schema import Positive
 from experiments.engine import Count, Row, Settings
 from experiments.report import compare
 from experiments.tables import grouped
-from experiments.wire import age, command, follow, latency, parity, polls
+from experiments.wire import age, characterize, command, follow, latency, parity, polls
 from experiments.wire import faults as faults_module
 
 NEVER = (0.0, 0.0)  # bound of what must never happen, on any machine: hanging, or moving beyond the limits
@@ -47,6 +48,8 @@ FAULT_COLUMNS = (
     "outcome", "settled [s]", "halted [s]", "recovered [s]", "moved [deg]", "beyond [deg]", "ended [s]", "hangs",
     "tracebacks", "runs",
 )  # fmt: skip
+SCALE_OFF, STOP_OFF_S, DELAY_OFF_S, GROWTH_OFF = 0.01, 0.03, 0.02, 0.02  # limits, of what is found of a dome
+CHARACTERIZED = ("signs", "orientation", "pan_off", "tilt_off", "stop_off_s", "delay_off_s", "growth_off", "took_s")
 AGAIN = "measured"  # number of repetitions, in rows of what was measured more than once
 Figure = dict[str, Any]
 
@@ -56,7 +59,9 @@ class WireSettings(Settings):
     """Settings: figures and durations of their measurement."""
 
     # Figures to measure.
-    only: tuple[str, ...] = ("polls", "age", "stream_age", "command", "faults", "latency", "parity", "follow")
+    only: tuple[str, ...] = (
+        "polls", "age", "stream_age", "command", "faults", "latency", "parity", "follow", "characterize",
+    )  # fmt: skip
     poll_s: Positive = 10.0  # polling of one unit [s]
     age_s: Positive = 30.0  # reading of the stream [s]
     targets: tuple[str, ...] = ("book", "person")  # targets that are followed to time commands
@@ -69,6 +74,7 @@ class WireSettings(Settings):
     still_s: Positive = 6.0  # following at each place [s]
     domes: tuple[str, ...] = ()  # domes with which the person is followed; all if empty
     follow_s: Positive = 30.0  # following of the person [s]
+    drawn: Count = 4  # domes drawn by seed that are characterized
     tries: Count = 1  # largest number of measurements of a figure that a busy machine has disturbed
 
     def __post_init__(self) -> None:
@@ -79,14 +85,16 @@ class WireSettings(Settings):
 
 
 def jobs(settings: WireSettings) -> Sequence[int]:
-    """Give a job for each figure, and for each dome that is followed with."""
+    """Give a job for each figure, and for each dome that is followed with or characterized."""
     return range(len(_measurements(settings)))
 
 
 def _measurements(settings: WireSettings) -> list[str]:
-    """List the figures, with "follow" replaced by the domes."""
+    """List the figures, with "follow" replaced by the domes, and "characterize" by the seeds of those drawn."""
     domes = settings.domes or tuple(follow.DOMES)
-    return [name for figure in settings.only for name in (domes if figure == "follow" else (figure,))]
+    seeds = [str(settings.seed_base + i) for i in range(settings.drawn)]
+    several = {"follow": domes, "characterize": seeds}
+    return [name for figure in settings.only for name in several.get(figure, (figure,))]
 
 
 def one(settings: WireSettings, number: int) -> list[Row]:
@@ -96,6 +104,8 @@ def one(settings: WireSettings, number: int) -> list[Row]:
         with TemporaryDirectory(prefix="cotarget-wire-") as folder:
             if name in follow.DOMES:
                 rows = follow.run(Path(folder), name, settings.follow_s, settings.seed_base)
+            elif name.isdigit():
+                rows = characterize.run(Path(folder), int(name))
             else:
                 rows = RUNS[name](settings, Path(folder))
         if time == settings.tries or not _spoilt(rows):
@@ -152,14 +162,40 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         said = f" ({row['error']})" if row["error"] else ""
         name = f"follow, {row['dome']}: yield {row['wire']:.3f} for {row['sim']:.3f} in the simulation{said}"
         figures[name] = at_least(row["wire"] / row["sim"], follow.DOMES[row["dome"]].wanted, "of it")
+    figures |= _of_characterized(of.get("characterize", []))
     loads = [row["load"] for row in rows]
     return {
         "figures": figures,
         "parts": _parts(of),
         "faults": faults,
+        "characterized": {
+            f"{row['seed']}: {row['profiles'] or 'by the standard'}": {name: row.get(name) for name in CHARACTERIZED}
+            for row in of.get("characterize", [])
+        },
         "again": {name: again for name, mine in of.items() if (again := mine[0].get(AGAIN))},
         "load": [min(loads, default=math.nan), max(loads, default=math.nan)],
     }
+
+
+def _of_characterized(rows: Sequence[Row]) -> dict[str, Figure]:
+    """Give the largest errors of what was found of drawn domes."""
+    if not rows:
+        return {}
+    found = [row for row in rows if not row["failed"]]
+    wrong = sum(not (row["signs"] and row["orientation"]) for row in found)
+    figures = {
+        f"characterize, of {len(rows)} domes without an end": at_most(len(rows) - len(found), 0, "domes"),
+        "characterize, signs or orientation wrong": at_most(wrong, 0, "domes"),
+    }
+    for name, columns, limit, unit in (
+        ("degrees a unit", ("pan_off", "tilt_off"), SCALE_OFF, "of it"),
+        ("time of a stop", ("stop_off_s",), STOP_OFF_S, "s"),
+        ("time from a command to its picture", ("delay_off_s",), DELAY_OFF_S, "s"),
+        ("magnification", ("growth_off",), GROWTH_OFF, "of it"),
+    ):
+        worst = max((row[column] for row in found for column in columns), default=math.nan)
+        figures[f"characterize, {name}: largest error"] = at_most(worst, limit, unit)
+    return figures
 
 
 def _ages_ms(rows: Sequence[Row]) -> Array:
@@ -261,7 +297,7 @@ def _of_faults(faults: dict[str, dict[str, Any]]) -> dict[str, Figure]:
 SETTINGS = WireSettings(seeds=1)
 QUICK = replace(
     SETTINGS,
-    only=tuple(name for name in SETTINGS.only if name != "stream_age"),
+    only=tuple(name for name in SETTINGS.only if name not in ("stream_age", "characterize")),
     domes=("visca", "stale-status", "no-status", "missing-is-zero", "continuous-only, stops after 0.4 s"),
     follow_s=10.0,
     poll_s=2.0,

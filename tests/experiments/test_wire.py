@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.wire import command, faults, latency, wire
+from cotarget.config import parse_config
+from cotarget.emulators.onvif import lens_table
+from experiments.wire import characterize, command, faults, latency, wire
 from experiments.wire.command import Notes, Turn
 from experiments.wire.rig import Tap
 from experiments.wire.wire import summarise
@@ -64,6 +66,48 @@ def test_true_delays_of_commands():
     tap, notes = Tap(None, None), Notes(None, 0.0, [Turn(2.0, 2.0), Turn(5.0, 5.0)])
     tap.written = [(1.9, b"PP7 "), (2.005, b"PP "), (2.01, b"PS100 "), (2.02, b"PP-96 "), (2.03, b"TP8 ")]
     assert latency.true_command_delays(notes, tap, 0.04) == pytest.approx([0.02 + 6 / 960 + 0.04])
+
+
+def characterized(**found):
+    row = {"figure": "characterize", "seed": 7, "profiles": "", "took_s": 100.0, "load": 1.0, "failed": False}
+    row |= {"signs": True, "orientation": True, "pan_off": 0.002, "tilt_off": 0.004, "stop_off_s": 0.01}
+    return row | {"delay_off_s": 0.005, "growth_off": 0.01} | found
+
+
+def test_the_largest_errors_of_drawn_domes_count():
+    failed = {"figure": "characterize", "seed": 8, "profiles": "", "took_s": 600.0, "load": 1.0, "failed": True}
+    rows = [characterized(), characterized(pan_off=0.03, signs=False), characterized(orientation=False), failed]
+    figures = summarise(rows)["figures"]
+    measured = {name.removeprefix("characterize, "): figure["measured"] for name, figure in figures.items()}
+    assert measured == {
+        "of 4 domes without an end": 1,
+        "signs or orientation wrong": 2,
+        "degrees a unit: largest error": 0.03,
+        "time of a stop: largest error": 0.01,
+        "time from a command to its picture: largest error": 0.005,
+        "magnification: largest error": 0.01,
+    }
+    assert sum(not figure["reached"] for figure in figures.values()) == 3
+
+
+def test_what_was_found_of_a_dome_is_compared_with_the_truth():
+    """By hand: pan counts the other way and its range is 10 % too small; the lens is that of the emulator."""
+    config = parse_config({"sim": {}})
+    head, (shortest, longest) = config.sim.head, config.sim.zoom.focal_mm
+    facts = replace(characterize.drawn(0), signs=(-1, 1), picture=("upside-down",), stop_s=0.4)
+    keys = {"pan_sign": -1, "pan_deg": [0.9 * end for end in head.pan_deg], "tilt_deg": list(head.tilt_deg)}
+    keys |= {"stop_delay_s": 0.43, "latency_s": 0.25, "command_delay_s": 0.05}
+    keys |= {"lens": lens_table(longest / shortest)}
+    row = characterize.errors(facts, config, keys, "Its picture is upside down, against the fixed camera's", 0.31)
+    assert row["signs"]
+    assert row["orientation"]
+    assert row["pan_off"] == pytest.approx(0.1)
+    assert row["tilt_off"] == pytest.approx(0.0)
+    assert (row["stop_off_s"], row["delay_off_s"]) == pytest.approx((0.03, 0.01))
+    assert row["growth_off"] < 0.15  # by how much the true focal length differs from the nominal one
+    row = characterize.errors(facts, config, keys | {"pan_sign": 1}, "", 0.31)
+    assert not row["signs"]
+    assert not row["orientation"]
 
 
 def stalled(settled_s, hang=0):
