@@ -34,7 +34,7 @@ from experiments.engine import Row
 from experiments.wire.rig import load, talking
 
 USER, PASSWORD = "operator", "secret"
-FIXED_HZ = 2.0  # of the fixed camera, of which the command takes one picture
+FIXED_HZ = 5.0  # of the fixed camera, of which the command takes one picture; the watchdog wants three in a second
 LONGEST_S = 600.0  # a command that takes longer is given up [s]
 MOST_TIMES = 2  # that the command is run
 AGAIN = "again"  # in the words of the command, where a second time would find more

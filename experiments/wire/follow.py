@@ -72,6 +72,7 @@ SLOW = (*STEERED, "lowest-speed")
 DOMES: Mapping[str, Dome] = {
     "visca": Dome(protocol="visca", wanted=0.95),
     "onvif": Dome(wanted=0.95),
+    "visca, board": Dome(protocol="visca", wanted=0.95, board=True),
     "onvif, board": Dome(wanted=0.95, board=True),
     "pan-reversed": Dome(("pan-reversed",), {"pan_sign": -1}),
     "tilt-reversed": Dome(("tilt-reversed",), {"tilt_sign": -1}),
