@@ -155,6 +155,7 @@ class Loop:
         self.errors: deque[DeviceError] = deque(maxlen=1)  # of a move without a waiting caller; the next call raises it
         self.lens_errors: deque[DeviceError] = deque(maxlen=1)
         self._zooming: tuple[float, float] | None = None  # the lens's goal, and when it should have arrived [s]
+        self._zoomed_from = 0.0  # where the lens was at the first of the commands that it has not obeyed
         self._heard_t = [clock.now()] * len(self._tracks)  # when each axis last had a poll of a later time
         self._unheard = [0] * len(self._tracks)  # polls since then
         while not all(track.polls for track in self._tracks):
@@ -275,7 +276,13 @@ class Loop:
         longest = abs(position - lens.newest.position) / lens.facts.fastest + 2 * lens.facts.braking_s(
             lens.facts.fastest
         )
-        self._zooming = position, self._clock.now() + longest + self._delay + PATIENCE_S
+        deadline = self._clock.now() + longest + self._delay + PATIENCE_S
+        here, before = lens.newest.position, self._zooming
+        if before and lens.facts.is_near(here, self._zoomed_from) and not lens.facts.is_near(here, before[0]):
+            deadline = min(deadline, before[1])  # it has obeyed none of the commands so far
+        else:
+            self._zoomed_from = here
+        self._zooming = position, deadline
 
     def _report_strange_motion(self) -> None:
         """Warn, once a motion, of a head that leaves the place where it stood although nothing was commanded."""

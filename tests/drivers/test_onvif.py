@@ -436,6 +436,19 @@ def test_a_device_that_takes_velocities_is_steered_to_its_goal(profiles):
         assert unit.pan.degrees() < 80.0
 
 
+def test_a_lens_that_obeys_nothing_is_an_error_however_often_it_is_sent_elsewhere():
+    """From end to end takes 0.5 s; it is sent to another place ten times a second, and has 2 s more to arrive."""
+    with OnvifUnit("absolute-ignored") as unit, opened(unit, absolute=False, zoom_s=0.5) as dome:
+        shortest, longest = dome.zoom.focal_range
+
+        def zoom_on():
+            time.sleep(0.1)
+            dome.zoom.zoom((shortest + longest) / 2 * (1.0 + 0.1 * (time.monotonic() % 1.0)))
+
+        assert "the lens at" in (said := fails(zoom_on))
+        assert "did not arrive in time: it is at 0 where" in said
+
+
 def test_a_steered_dome_that_loses_its_position_is_stopped_and_named():
     with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
         dome.head.move(math.radians(60.0), 0.0, speed=math.radians(40.0))
