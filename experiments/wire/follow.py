@@ -22,9 +22,10 @@ import numpy as np
 import tomli_w
 
 from cotarget.backends import open_rig
+from cotarget.calibration import Calibration
 from cotarget.calibration.calibrate import calibrate
 from cotarget.cli.emulate import RENDER_THREADS, SWITCH_S
-from cotarget.config import RigConfig, parse_config
+from cotarget.config import BoardConfig, RigConfig, parse_config
 from cotarget.emulators.emulation import Emulation
 from cotarget.emulators.world import paced
 from cotarget.errors import CotargetError
@@ -32,7 +33,7 @@ from cotarget.evaluation import closeup_of
 from cotarget.files import write_atomically
 from cotarget.metrics import WHOLLY_VISIBLE
 from cotarget.pipeline import Step, follow
-from cotarget.rig import opened_from
+from cotarget.rig import Rig, opened_from
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
@@ -44,6 +45,7 @@ WATCHDOG_S = 2.0  # a machine that is busy with other things does not halt the h
 LEARNT_S = 2.0  # the background is learnt [s]
 USER, PASSWORD = "operator", "secret"
 LATE_STREAM_S = 0.6
+PLACEMENTS, STOPS, FAR_PLACEMENTS = 12, 4, 4  # of the board: some minutes, less than by default
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def run(folder: Path, name: str, seconds: float, seed: int) -> list[Row]:
         try:
             with open_rig(folder / "rig.toml") as rig:
                 own = opened_from(rig)
-                found = calibrate(rig, own.board, seed=seed) if dome.board else exact_calibration(config)
+                found = _calibrated(rig, own.board, seed) if dome.board else exact_calibration(config)
                 begun = time.monotonic()
                 for times in _seen(follow(rig, found, own.target(NAME), seconds=seconds)):
                     seen.append(times)
@@ -134,6 +136,10 @@ def run(folder: Path, name: str, seconds: float, seed: int) -> list[Row]:
     late_s = float(np.median([each.done - each.fixed for each in seen])) - config.sim.fixed.latency_s
     sim = _simulated(config, dome, begun - start, fixed_hz, zoom_hz, late_s, seconds)
     return [row | {"fixed_hz": fixed_hz, "zoom_hz": zoom_hz, "late_s": late_s, "sim": sim}]
+
+
+def _calibrated(rig: Rig, board: BoardConfig, seed: int) -> Calibration:
+    return calibrate(rig, board, placements=PLACEMENTS, stops=STOPS, far_placements=FAR_PLACEMENTS, seed=seed)
 
 
 class Times(NamedTuple):
