@@ -187,6 +187,12 @@ class Timed:
         """Call it off."""
         if self.timer is not None:
             self.timer.cancel()
+            self.timer = None
+
+    @property
+    def is_planned(self) -> bool:
+        """Whether it is still to happen."""
+        return self.timer is not None and self.timer.is_alive()
 
 
 class OnvifCamera:
@@ -351,12 +357,12 @@ class OnvifCamera:
         return min(self.model.speed_deg_s, next(cap for end, cap in CAPS if share <= end))
 
     def halt(self) -> None:
-        """Begin to brake, after the time that the device takes for it."""
+        """Begin to brake, after the time that the device takes for it; a stop under way is not begun anew."""
         late = max((s for name, s in STOPS_LATE_S.items() if name in self._faults), default=0.0)
-        if late:
-            self._stop.after(late, self._brake)
-        else:
+        if not late:
             self._brake()
+        elif not self._stop.is_planned:
+            self._stop.after(late, self._brake)
 
     def _brake(self) -> None:
         with self._lock:

@@ -152,6 +152,18 @@ def test_it_turns_on_after_a_stop(profile, late_s):
         assert time.monotonic() - begin > late_s
 
 
+def test_a_second_stop_does_not_delay_the_first():
+    with dome("slower-stop") as unit:
+        done(unit, "ContinuousMove", turned("Velocity", 0.1, 0))
+        wait_for(lambda: unit.pan.degrees() > 2.0)
+        begin = time.monotonic()
+        done(unit, "Stop")
+        time.sleep(0.7)
+        done(unit, "Stop")
+        rest(unit)
+        assert 1.1 < time.monotonic() - begin < 1.1 + 0.6
+
+
 def test_a_stop_is_ignored_and_a_velocity_of_zero_is_not():
     with dome("stop-ignored") as unit:
         done(unit, "ContinuousMove", turned("Velocity", 0.1, 0))
