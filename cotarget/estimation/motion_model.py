@@ -11,12 +11,14 @@ The state x has 13 components, which constants name:
 The fixed camera measures both tangents and the size, `LOG_DEPTH` - `LOG_SIZE` - `LOG_APPARENT`, all linearly. The depth
 itself appears nowhere in the motion and only scales the noise, so bearings alone can never pretend to have measured it
 (modified spherical coordinates of Stallard, 1987, in tangents). The acceleration c decays after Singer (1970):
-c' = -c / tau + white noise.
+c' = -c / tau + white noise. Of what flies it also turns with the velocity v, as in a coordinated turn:
+c' = -c / tau + w x c + white noise, with the turn rate w = v x c / v^2.
 
 `FilterSettings` holds what is assumed before anything is measured, for each kind of target. The comparison of
 motion models and the choice of the numbers: docs/design-notes.md.
 """
 
+import cmath
 import functools
 import math
 from collections.abc import Mapping
@@ -48,7 +50,7 @@ class MotionSettings:
     Attributes:
         acceleration: standard deviation of the acceleration along each axis [m/s^2].
         manoeuvre_s: time constant of the acceleration [s]. Much less than a frame's time makes the velocity a
-            random walk; much more makes the acceleration constant.
+            random walk; much more makes the acceleration constant, or each turn a circle.
         speed: standard deviation of the velocity along each axis [m/s].
         size_sigma: standard deviation of the logarithm of the true size over the nominal one.
         attitude_mean: mean of the logarithm of the apparent size over the true one; negative if foreshortened.
@@ -57,6 +59,7 @@ class MotionSettings:
         bias_sigma: standard deviation of the head's bias, in pan and tilt each [rad].
         bias_s: time constant of that bias [s].
         nearest: least depth of a target, along the fixed camera's axis [m].
+        turns: whether the acceleration turns with the velocity, as in a coordinated turn.
     """
 
     acceleration: float
@@ -69,6 +72,7 @@ class MotionSettings:
     bias_sigma: float = 7e-4
     bias_s: float = 60.0
     nearest: float = 0.1
+    turns: bool = False
 
     @property
     def fading_s(self) -> float:
@@ -126,7 +130,7 @@ class FilterSettings:
 MOTIONS = {
     "standing": MotionSettings(0.5, 0.5, 0.7, 0.01, attitude_sigma=0.01, attitude_s=2.0),
     "walking": MotionSettings(0.8, 0.7, 1.2, 0.04),
-    "flying": MotionSettings(6.5, 2.5, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0),
+    "flying": MotionSettings(6.5, 5.0, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0, turns=True),
     "general": MotionSettings(2.5, 1.0, 3.0, 0.075, attitude_sigma=0.2, attitude_s=1.0),
 }
 # Measurement noise that differs from the defaults, by the target profile's `matcher`. The errors of an outline last
@@ -168,15 +172,18 @@ SHORT = 0.03
 MOST_UNCERTAINTY = 0.5
 # Largest variance of the logarithm of the depth, before and however long after it is measured: a factor of some five.
 MOST_DEPTH_VARIANCE = 1.5**2
+# Least turn rate: what is less is straight to 1e-7 of its way in a second [rad/s].
+LEAST_TURN = 1e-3
 
 
 @functools.lru_cache(maxsize=1024)  # frames come at regular intervals
-def transition(dt: float, motion: MotionSettings) -> tuple[Array, Array, Array]:
+def transition(dt: float, motion: MotionSettings) -> tuple[Array, Array, Array, float]:
     """Compute the parts of a prediction that depend only on the time step ``dt`` > 0 [s]; cached.
 
     Returns:
-        Linear motion before the division by the new depth, (13, 13); covariance of position, velocity and acceleration
-        for unit variance of the acceleration, (9, 9); variances that attitude and bias gain, (13, 13).
+        Linear motion before the division by the new depth, (13, 13), without the acceleration if that turns; covariance
+        of position, velocity and acceleration for unit variance of the acceleration, (9, 9); variances that attitude
+        and bias gain, (13, 13); what is left of the velocity along the axis.
     """
     tau = motion.manoeuvre_s
     rho = math.exp(-dt / tau)
@@ -184,14 +191,66 @@ def transition(dt: float, motion: MotionSettings) -> tuple[Array, Array, Array]:
     reach = tau * (dt - gain)
     # An unmeasured depth must not run away: its velocity fades, so that its variance stays at the target's speed.
     fade, attitude, bias = (math.exp(-dt / each) for each in (motion.fading_s, motion.attitude_s, motion.bias_s))
-    linear = np.diag([*[1.0] * 5, fade, *[rho] * 3, 1.0, attitude, bias, bias])
+    if motion.turns:  # see `_turned`
+        reach, gain, rho = 0.0, 0.0, 0.0
+    linear = np.diag([*[1.0] * 6, *[rho] * 3, 1.0, attitude, bias, bias])
     for i in range(3):
         linear[i, VEL_X + i], linear[i, ACC_X + i], linear[VEL_X + i, ACC_X + i] = dt, reach, gain
-    linear[VEL_Z, ACC_Z] *= fade
     sigmas = np.zeros(STATES)
     sigmas[LOG_APPARENT:] = motion.attitude_sigma, motion.bias_sigma, motion.bias_sigma
     drift = np.diag(sigmas**2 * (1 - linear.diagonal() ** 2))
-    return linear, np.kron(_singer(dt, tau), np.eye(3)).astype(float), drift
+    return linear, np.kron(_singer(dt, tau), np.eye(3)).astype(float), drift, fade
+
+
+def _turned(x: Array, P: Array, dt: float, tau: float) -> tuple[Array, Array]:
+    """Integrate an acceleration that decays and turns with the velocity, at a constant turn rate.
+
+    In the plane of the turn, the acceleration is multiplied by exp((-1 / tau + i |w|) t). The velocity's variance is
+    part of the mean of v^2: a target without a certain velocity has no turn.
+
+    Args:
+        x: state, (13,).
+        P: its covariance, (13, 13).
+        dt: time step [s].
+        tau: time constant of the acceleration [s].
+
+    Returns:
+        What the acceleration adds to position and velocity, and the new acceleration, (9,); its derivatives by velocity
+        and acceleration, (9, 6).
+    """
+    v, c = x[VELOCITY], x[ACCELERATION]
+    vv, vc, cc = float(v @ v), float(v @ c), float(c @ c)
+    squared = vv + float(P[VEL_X, VEL_X] + P[VEL_Y, VEL_Y] + P[VEL_Z, VEL_Z])
+    along, across, part = vc / squared, cc / squared, vv / squared
+    turn = max(math.sqrt(max(vv * cc - vc * vc, 0.0)) / squared, LEAST_TURN)
+    pole = complex(-1 / tau, turn)
+    decay = cmath.exp(pole * dt)
+    gain = (decay - 1) / pole
+    reach = (gain - dt) / pole
+    by_gain = (dt * decay - gain) / pole  # derivatives by the pole
+    by_reach = (by_gain - reach) / pole
+    # Position, velocity and acceleration: factors of c and of w x c, and their derivatives by the turn rate's square.
+    factors, slopes = [], []
+    for factor, slope in ((reach, by_reach), (gain, by_gain), (decay, dt * decay)):
+        aside = factor.imag / turn
+        factors.append((factor.real, aside))
+        slopes.append((-slope.imag / (2 * turn), (slope.real - aside) / (2 * turn * turn)))
+    both = np.array([c, along * c - across * v])  # c and w x c
+    out = np.array(factors) @ both
+    # Derivatives by (v, c): of `along` and `across`, (2, 6), of the turn rate's square, (6,), and of w x c, (3, 6).
+    by = np.empty((2, 6))
+    by[0, :3], by[0, 3:] = (c - 2 * along * v) / squared, v / squared
+    by[1, :3], by[1, 3:] = -2 * across / squared * v, 2 / squared * c
+    by_square = part * by[1] - 2 * along * by[0]
+    by_square[:3] += 2 * across * (1 - part) / squared * v
+    by_turned = np.array([c, -v]).T @ by
+    by_turned.flat[::7] -= across
+    by_turned.flat[3::7] += along
+    J = np.array([aside for _, aside in factors])[:, None, None] * by_turned
+    J += (np.array(slopes) @ both)[:, :, None] * by_square
+    for i, (straight, _) in enumerate(factors):
+        J[i].flat[3::7] += straight
+    return out.ravel(), J.reshape(9, 6)
 
 
 def _singer(dt: float, tau: float) -> Array:
@@ -227,16 +286,21 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale
     """
     if dt <= 0:
         return x, P
-    linear, noise, drift = transition(dt, motion)
-    reach = float(linear[TAN_X, ACC_X])  # position gained per unit of acceleration [s^2]
-    closer = 1 + float(x[VEL_Z]) * dt + float(x[ACC_Z]) * reach  # new depth over old depth
+    linear, noise, drift, fade = transition(dt, motion)
+    y, F = linear @ x, linear.copy()
+    if motion.turns:
+        gained, by_moving = _turned(x, P, dt, motion.manoeuvre_s)
+        y[MOVING] += gained
+        F[MOVING, VEL_X:LOG_SIZE] += by_moving
+    y[VEL_Z] *= fade
+    F[VEL_Z] *= fade
+    closer = 1 + float(y[LOG_DEPTH] - x[LOG_DEPTH])  # new depth over old depth
     ratio = max(closer, min(motion.nearest * math.exp(-x[LOG_DEPTH]), 1.0))
-    y = linear @ x
     log_depth = float(x[LOG_DEPTH]) + math.log(ratio)
     y[MOVING] /= ratio
     y[LOG_DEPTH] = log_depth
     y[LOG_APPARENT] += motion.attitude_mean * (1 - linear[LOG_APPARENT, LOG_APPARENT])
-    F = linear.copy()
+    by_closer = F[LOG_DEPTH, VEL_X:LOG_SIZE].copy()
     F[MOVING] /= ratio
     F[LOG_DEPTH] = 0.0
     F[LOG_DEPTH, LOG_DEPTH] = 1.0
@@ -245,8 +309,7 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale
     else:
         shrink = y[MOVING] / ratio
         shrink[LOG_DEPTH] = -1 / ratio
-        F[MOVING, VEL_Z] -= shrink * dt
-        F[MOVING, ACC_Z] -= shrink * reach
+        F[MOVING, VEL_X:LOG_SIZE] -= shrink[:, None] * by_closer
     P = F @ P @ F.T + drift
     # Position noise along the axis scales everything that is divided by the depth.
     N = np.eye(LOG_SIZE)

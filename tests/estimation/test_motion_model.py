@@ -76,13 +76,46 @@ def test_a_constant_acceleration_is_a_parabola():
     np.testing.assert_allclose(math.exp(y[2]) * y[3:6], v + c * dt, atol=tolerance)
 
 
-def test_the_covariance_is_propagated_by_the_motions_derivative():
+def test_a_turn_is_a_circle():
+    """By its closed form, of a bird that circles upright in the image, at some distance that changes nothing."""
+    endless = MotionSettings(1.0, 1e6, 1e6, 0.04, turns=True)
+    radius, speed, depth, dt = 10.0, 8.0, 20.0, 1.5
+    x = state(position=[0.1, -0.2, math.log(depth)], velocity=[0.0, speed / depth, 0.0])
+    x[6] = speed**2 / radius / depth
+    y, _ = propagate(x, ZERO, dt, endless)
+    angle = speed / radius * dt
+    way = radius * np.array([1 - math.cos(angle), math.sin(angle), 0.0])
+    tolerance = 1e-5  # a time constant of 1e6 s is no eternity
+    np.testing.assert_allclose(
+        depth * np.array([y[0], y[1], 1.0]), depth * np.array([0.1, -0.2, 1.0]) + way, atol=tolerance
+    )
+    np.testing.assert_allclose(
+        depth * y[3:6], speed * np.array([math.sin(angle), math.cos(angle), 0.0]), atol=tolerance
+    )
+
+
+def test_a_target_without_a_certain_velocity_has_no_turn():
+    """Its acceleration is predicted as that of a target that walks."""
+    x = state(position=[0.1, -0.2, 2.3], velocity=[0.1, 0.0, 0.0], acceleration=[0.0, 0.3, 0.0])
+    unknown = np.diag([0.0] * 3 + [100.0] * 3 + [0.0] * 7)  # standard deviation of a hundred times the velocity
+    turning, straight = (
+        propagate(x, unknown, 0.5, MotionSettings(1.0, 1.0, 10.0, 0.04, turns=turns))[0] for turns in (True, False)
+    )
+    np.testing.assert_allclose(turning, straight, atol=1e-3 * 0.3)  # a thousandth of the acceleration's effect
+
+
+@pytest.mark.parametrize("kind", ["walking", "flying"])
+def test_the_covariance_is_propagated_by_the_motions_derivative(kind):
     x = np.array([0.2, -0.1, 2.5, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.1, 0.1, 0.01, 0.01])
-    motion, P = MOTIONS["flying"], np.diag(np.linspace(1e-6, 3e-6, STATES))
-    F = jacobian(lambda x: propagate(x, ZERO, 0.3, motion)[0], x)
+    motion, P = MOTIONS[kind], np.diag(np.linspace(1e-6, 3e-6, STATES))
+    F = jacobian(lambda x: propagate(x, P, 0.3, motion)[0], x)
     moved = F @ P @ F.T
-    noise = propagate(x, ZERO, 0.3, motion)[1]
-    noise[:9, :9] *= math.exp(2 * moved[2, 2])  # the mean of 1 / depth^2: an uncertain depth makes the noise larger
+    known = np.zeros_like(P)  # but for the velocity's variance, on which a turn depends
+    known[3:6, 3:6] = P[3:6, 3:6]
+    moved_known = F @ known @ F.T
+    noise = propagate(x, known, 0.3, motion)[1] - moved_known
+    # The mean of 1 / depth^2: an uncertain depth makes the noise larger.
+    noise[:9, :9] *= math.exp(2 * (moved[2, 2] - moved_known[2, 2]))
     np.testing.assert_allclose(propagate(x, P, 0.3, motion)[1] - noise, moved, atol=1e-6 * DERIVATIVE)
 
 
