@@ -22,7 +22,7 @@ from cotarget.estimation.clock_offset import LEAST_S, ClockOffset
 from cotarget.estimation.measurement_model import Pose
 from cotarget.estimation.motion_model import GATE, HEAD_SIGMA, LOG_DEPTH, VELOCITY
 from cotarget.estimation.target_filter import inflated
-from cotarget.estimation.zoom_matching import CloseupFinder, Finder, MatchingSettings, ZoomMeasurement, outline_size
+from cotarget.estimation.zoom_matching import CloseupFinder, Finder, MatchingSettings, ZoomMeasurement, outline_in
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image, PanTiltState, ZoomState
 from cotarget.targets import Target
@@ -200,6 +200,7 @@ class ZoomSearch:
             return None
         found = self._find(due, pose, estimate, seen)
         if found is not None:
+            found, size = self._outlined(due, found, seen, estimate.target)
             # Both cameras show the same point, but wings and limbs move it. With the registration's own error alone,
             # the filter would take their beats for motion of the target.
             sigma_px = np.hypot(found.sigma_px, found.body_sigma_px)
@@ -213,7 +214,7 @@ class ZoomSearch:
                 due.t,
                 head_sigma=head_sigma,
                 time_sigma_s=self.clock.uncorrected_s,
-                size=self._size(due, found, seen, estimate.target),
+                size=size,
             )
             self.clock.add(target.filter.observations)
         return found
@@ -300,22 +301,26 @@ class ZoomSearch:
         self._count_unfound(frame, found, replace(seen, covariance=seen.covariance + head_covariance), estimate)
         return found
 
-    def _size(
+    def _outlined(
         self, frame: Frame, found: ZoomMeasurement, seen: Appearance, profile: TargetProfile
-    ) -> tuple[float, float] | None:
-        """Measure the wingspan of a target found in a zoom frame [tangent], and its relative standard deviation.
+    ) -> tuple[ZoomMeasurement, tuple[float, float] | None]:
+        """Measure body and wingspan of a target found in a zoom frame by its outline there.
 
         The fixed camera shows a far bird's body, and a part of a near one before trees. A height is left to the fixed
         camera, which shows feet and shadow apart as well.
+
+        Returns:
+            The measurement; the wingspan [tangent] and its relative standard deviation, None where it is not measured.
         """
-        if not profile.largest_over_time:
-            return None
-        sides_px = outline_size(frame.image, found.center_px, seen.size_px, self._matching)
-        if sides_px is None:
-            return None
-        width, height = (sides_px / seen.focal_px).tolist()
+        outline = None
+        if profile.largest_over_time:
+            outline = outline_in(frame.image, found.center_px, seen.size_px, self._matching)
+        if outline is None:
+            return found, None
+        width, height = (outline.size_px / seen.focal_px).tolist()
         self._sizes.add(frame.t, (0.0, 0.0), (width, height), clipped=False)
-        return self._sizes.larger_side, math.hypot(1 / float(sides_px.max()), 1 / self._matching.fine_samples)
+        sigma = math.hypot(1 / float(outline.size_px.max()), 1 / self._matching.fine_samples)
+        return outline.refine(found), (self._sizes.larger_side, sigma)
 
     def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
         """Count the time for which the zoom image should have shown the target and did not."""

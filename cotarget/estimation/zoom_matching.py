@@ -7,7 +7,7 @@ place counts only if it leads the next best one. The source of the numbers: docs
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -25,6 +25,9 @@ from cotarget.rig import Detection, Frame, Image
 # Standard deviation of the body's centre along u and v, in parts of the box's sides, by the target profile's matcher;
 # None where the outline is not known. Measured on simulated targets.
 BODY_SIGMA = {"box": (0.01, 0.01), "upright": (0.03, 0.006), "outline": (0.05, 0.12), None: (0.08, 0.18)}
+# Standard deviation of the body's centre by an outline in the zoom image, along u and v each, in parts of the outline's
+# larger side. Measured on simulated birds.
+THICKEST_SIGMA = 0.03
 # Step for derivatives, in parts of the depth.
 STEP = 1e-3
 LEAST_SQUARE = 8  # smallest square with an outline and its surroundings [samples]
@@ -332,9 +335,28 @@ def _next_best(score: np.ndarray, place: tuple[int, int], size: Array) -> float:
     return max(float(others.max()), 0.0)
 
 
-def outline_size(
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Outline of a target in the zoom image.
+
+    Attributes:
+        size_px: width and height, (2,).
+        body_px: centre of the largest circle inside: a bird's body, wherever its wings are (u, v), (2,).
+    """
+
+    size_px: Array
+    body_px: Array
+
+    def refine(self, found: ZoomMeasurement) -> ZoomMeasurement:
+        """Take the body's centre from this outline, unless it is three standard deviations from where it was found."""
+        sigma_px = np.full(2, THICKEST_SIGMA * float(self.size_px.max()))
+        off = (self.body_px - found.center_px) / np.hypot(found.body_sigma_px, sigma_px)
+        return found if off @ off > GATE else replace(found, center_px=self.body_px, body_sigma_px=sigma_px)
+
+
+def outline_in(
     image: Image, center_px: Array, expected_px: float, settings: MatchingSettings = MatchingSettings()
-) -> Array | None:
+) -> Outline | None:
     """Measure the outline of a target before a plain background in the zoom image.
 
     The outline is the largest region whose colour differs from that at the border of a square about the target.
@@ -346,8 +368,7 @@ def outline_size(
         settings: settings of the registration.
 
     Returns:
-        Width and height of the outline, (2,) [px]; None if it reaches the border, lies elsewhere, or is too full or too
-        empty for a target's.
+        The outline; None if it reaches the border, lies elsewhere, or is too full or too empty for a target's.
     """
     low = np.maximum(np.floor(center_px - expected_px).astype(int), 0)
     high = np.minimum(np.ceil(center_px + expected_px).astype(int) + 1, image.shape[1::-1])
@@ -360,17 +381,21 @@ def outline_size(
     background = patch[border]
     away = (patch - np.median(background, axis=0)) @ _whitening(background, settings)
     differs = np.sum(away**2, axis=2) > GATE
-    count, _, stats, _ = cv2.connectedComponentsWithStats(differs.astype(np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(differs.astype(np.uint8))
     if count == 1:  # the background alone
         return None
-    left, top, width, height, area = stats[1 + np.argmax(stats[1:, cv2.CC_STAT_AREA])].tolist()
+    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    left, top, width, height, area = stats[largest].tolist()
     first, size, at = np.array([left, top]), np.array([width, height]), (center_px - low) * sides / (high - low)
     least, most = settings.foreground
     is_whole = (first > 0).all() and (first + size < sides).all()
     is_there = (at >= first).all() and (at <= first + size).all()
-    return (
-        np.asarray(size * (high - low) / sides) if is_whole and is_there and least < area / size.prod() < most else None
-    )
+    if not (is_whole and is_there and least < area / size.prod() < most):
+        return None
+    depth = cv2.distanceTransform((labels == largest).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    thickest = np.array(cv2.minMaxLoc(depth)[3])
+    pitch_px = (high - low) / sides
+    return Outline(size * pitch_px, low + (thickest + 0.5) * pitch_px - 0.5)
 
 
 class Finder(Protocol):

@@ -13,7 +13,7 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.demo import SCENES, sim_config
 from cotarget.estimation.correlation import correlate, resample, summit
 from cotarget.estimation.measurement_model import Pose
-from cotarget.estimation.zoom_matching import CloseupFinder, look, outline_size
+from cotarget.estimation.zoom_matching import CloseupFinder, Outline, ZoomMeasurement, look, outline_in
 from cotarget.evaluation import true_calibration
 from cotarget.geometry import pose
 from cotarget.rig import Detection, Frame
@@ -139,17 +139,44 @@ def test_a_target_is_registered_at_any_focal_length_and_roll(nominal, roll_deg):
 def test_an_outline_is_measured_whatever_size_is_expected(nominal, wrong):
     scene = Scene([(1.5, -1.0, 20.0)], nominal)
     size_px = np.ptp(OUTLINE, axis=0) * nominal / 20.0
-    found = outline_size(scene.zoom().image, scene.zoom_px(scene.birds[0])[0], wrong * size_px.max())
-    assert found == pytest.approx(size_px, abs=OUTLINED * wrong * size_px.max())
+    found = outline_in(scene.zoom().image, scene.zoom_px(scene.birds[0])[0], wrong * size_px.max())
+    assert found is not None
+    assert found.size_px == pytest.approx(size_px, abs=OUTLINED * wrong * size_px.max())
+
+
+@pytest.mark.parametrize("wing", [-0.3, 0.0, 0.3])
+def test_the_body_of_a_bird_stays_where_it_is_when_it_beats_its_wings(wing):
+    """A round body with a tail and a wing that points up, at the camera or down, before a plain sky."""
+    image = np.full((480, 640, 3), 200, np.uint8)
+    body_px, scale = np.array([300.0, 250.0]), 400.0  # [px], [px/m]
+    tip = body_px + scale * np.array([0.1, wing])
+    tail = body_px + np.array([(0, -8), (110, -14), (110, 14), (0, 8)])
+    shoulder, half = np.array([16, 0]), np.array([8, 0])
+    for shape in (tail, np.array([body_px - shoulder, tip - half, tip + half, body_px + shoulder])):
+        cv2.fillPoly(image, [np.rint(shape).astype(np.int32)], (40, 40, 40))
+    cv2.circle(image, body_px.astype(int).tolist(), 26, (40, 40, 40), -1)
+    found = outline_in(image, body_px + np.array([10.0, 15.0]), 150.0)
+    assert found is not None
+    assert found.body_px == pytest.approx(body_px, abs=150.0 / 40)  # one sample of forty
+
+
+@pytest.mark.parametrize(("off_px", "taken"), [(20.0, True), (50.0, False)])
+def test_an_outline_refines_what_was_found_there_and_nothing_else(off_px, taken):
+    """A body found with a standard deviation of 10 px along each axis."""
+    found = ZoomMeasurement(np.array([300.0, 200.0]), 1.0, np.array([10.0, 10.0]), 0.0)
+    outline = Outline(np.array([100.0, 60.0]), np.array([300.0 + off_px, 200.0]))
+    refined = outline.refine(found)
+    assert refined.center_px == pytest.approx(outline.body_px if taken else found.center_px)
+    assert (refined.body_sigma_px < found.body_sigma_px).all() == taken
 
 
 def test_what_is_no_whole_outline_measures_no_size():
     scene = Scene([(1.5, -1.0, 20.0)])
     zoom, at = scene.zoom().image, scene.zoom_px(scene.birds[0])[0]
     larger_px = np.ptp(OUTLINE, axis=0).max() * scene.nominal / 20.0
-    assert outline_size(zoom, at, 0.4 * larger_px) is None  # it fills the square
-    assert outline_size(zoom, at + 1.4 * larger_px, 2.0 * larger_px) is None  # beside it
-    assert outline_size(scene.zoom(which=[]).image, at, larger_px) is None
+    assert outline_in(zoom, at, 0.4 * larger_px) is None  # it fills the square
+    assert outline_in(zoom, at + 1.4 * larger_px, 2.0 * larger_px) is None  # beside it
+    assert outline_in(scene.zoom(which=[]).image, at, larger_px) is None
 
 
 def test_nothing_is_found_in_an_empty_zoom_image():
