@@ -174,6 +174,7 @@ MOST_UNCERTAINTY = 0.5
 MOST_DEPTH_VARIANCE = 1.5**2
 # Least turn rate: what is less is straight to 1e-7 of its way in a second [rad/s].
 LEAST_TURN = 1e-3
+IDENTITY = np.eye(3)
 
 
 @functools.lru_cache(maxsize=1024)  # frames come at regular intervals
@@ -218,39 +219,40 @@ def _turned(x: Array, P: Array, dt: float, tau: float) -> tuple[Array, Array]:
         What the acceleration adds to position and velocity, and the new acceleration, (9,); its derivatives by velocity
         and acceleration, (9, 6).
     """
-    v, c = x[VELOCITY], x[ACCELERATION]
-    vv, vc, cc = float(v @ v), float(v @ c), float(c @ c)
+    both = x[VEL_X:LOG_SIZE].reshape(2, 3)
+    (vv, vc), (_, cc) = (both @ both.T).tolist()
     squared = vv + float(P[VEL_X, VEL_X] + P[VEL_Y, VEL_Y] + P[VEL_Z, VEL_Z])
-    along, across, part = vc / squared, cc / squared, vv / squared
-    turn = max(math.sqrt(max(vv * cc - vc * vc, 0.0)) / squared, LEAST_TURN)
+    along, across, part = vc / squared, cc / squared, vv / squared  # w x c = along c - across v
+    turn = max(math.sqrt(max(part * across - along * along, 0.0)), LEAST_TURN)
     pole = complex(-1 / tau, turn)
     decay = cmath.exp(pole * dt)
     gain = (decay - 1) / pole
     reach = (gain - dt) / pole
     by_gain = (dt * decay - gain) / pole  # derivatives by the pole
     by_reach = (by_gain - reach) / pole
-    # Position, velocity and acceleration: factors of c and of w x c, and their derivatives by the turn rate's square.
+    # Of the turn rate's square: factors of v and c in its derivatives by v and by c.
+    by_v = (2 * across * (1 - 2 * part) + 4 * along * along) / squared, -2 * along / squared
+    by_c = by_v[1], 2 * part / squared
+    # Of the additions to position and velocity, and of the new acceleration: factors of v and c; then the factors of v
+    # and c in the derivatives of these.
     factors, slopes = [], []
     for factor, slope in ((reach, by_reach), (gain, by_gain), (decay, dt * decay)):
         aside = factor.imag / turn
-        factors.append((factor.real, aside))
-        slopes.append((-slope.imag / (2 * turn), (slope.real - aside) / (2 * turn * turn)))
-    both = np.array([c, along * c - across * v])  # c and w x c
-    out = np.array(factors) @ both
-    # Derivatives by (v, c): of `along` and `across`, (2, 6), of the turn rate's square, (6,), and of w x c, (3, 6).
-    by = np.empty((2, 6))
-    by[0, :3], by[0, 3:] = (c - 2 * along * v) / squared, v / squared
-    by[1, :3], by[1, 3:] = -2 * across / squared * v, 2 / squared * c
-    by_square = part * by[1] - 2 * along * by[0]
-    by_square[:3] += 2 * across * (1 - part) / squared * v
-    by_turned = np.array([c, -v]).T @ by
-    by_turned.flat[::7] -= across
-    by_turned.flat[3::7] += along
-    J = np.array([aside for _, aside in factors])[:, None, None] * by_turned
-    J += (np.array(slopes) @ both)[:, :, None] * by_square
-    for i, (straight, _) in enumerate(factors):
-        J[i].flat[3::7] += straight
-    return out.ravel(), J.reshape(9, 6)
+        factors.append((-aside * across, factor.real + aside * along))
+        twice = (slope.real - aside) / (2 * turn * turn)
+        of_v, of_c, a = -twice * across, twice * along - slope.imag / (2 * turn), aside / squared
+        slopes.append(
+            (
+                (
+                    (2 * a * across + of_v * by_v[0], of_v * by_v[1]),
+                    (-2 * a * along + of_c * by_v[0], a + of_c * by_v[1]),
+                ),
+                ((of_v * by_c[0], -2 * a + of_v * by_c[1]), (a + of_c * by_c[0], of_c * by_c[1])),
+            )
+        )
+    by_both = np.array(factors)
+    J = both.T @ np.array(slopes) @ both + by_both[:, :, None, None] * IDENTITY
+    return (by_both @ both).ravel(), J.transpose(0, 2, 1, 3).reshape(9, 6)
 
 
 def _singer(dt: float, tau: float) -> Array:
