@@ -28,6 +28,9 @@ BODY_SIGMA = {"box": (0.01, 0.01), "upright": (0.03, 0.006), "outline": (0.05, 0
 # Standard deviation of the body's centre by an outline in the zoom image, along u and v each, in parts of the outline's
 # larger side. Measured on simulated birds.
 THICKEST_SIGMA = 0.03
+# Least median of the squared distance of an outline's colours from the background, in the background's variances: five
+# standard deviations. Blotches of foliage come to 17.
+DISTINCT = 5.0**2
 # Step for derivatives, in parts of the depth.
 STEP = 1e-3
 LEAST_SQUARE = 8  # smallest square with an outline and its surroundings [samples]
@@ -359,7 +362,8 @@ def outline_in(
 ) -> Outline | None:
     """Measure the outline of a target before a plain background in the zoom image.
 
-    The outline is the largest region whose colour differs from that at the border of a square about the target.
+    The outline is the largest region whose colour differs from that at the border of a square about the target, if most
+    of it differs clearly.
 
     Args:
         image: zoom image, (H, W, 3) BGR.
@@ -380,7 +384,8 @@ def outline_in(
     border[1:-1, 1:-1] = False
     background = patch[border]
     away = (patch - np.median(background, axis=0)) @ _whitening(background, settings)
-    differs = np.sum(away**2, axis=2) > GATE
+    contrast = np.sum(away**2, axis=2)
+    differs = contrast > GATE
     count, labels, stats, _ = cv2.connectedComponentsWithStats(differs.astype(np.uint8))
     if count == 1:  # the background alone
         return None
@@ -390,9 +395,10 @@ def outline_in(
     least, most = settings.foreground
     is_whole = (first > 0).all() and (first + size < sides).all()
     is_there = (at >= first).all() and (at <= first + size).all()
-    if not (is_whole and is_there and least < area / size.prod() < most):
+    inside = labels == largest
+    if not (is_whole and is_there and least < area / size.prod() < most and np.median(contrast[inside]) > DISTINCT):
         return None
-    depth = cv2.distanceTransform((labels == largest).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    depth = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     thickest = np.array(cv2.minMaxLoc(depth)[3])
     pitch_px = (high - low) / sides
     return Outline(size * pitch_px, low + (thickest + 0.5) * pitch_px - 0.5)
