@@ -260,7 +260,7 @@ class State(enum.StrEnum):
     FOLLOWING = "following"  # the head follows the target
     UNCONFIRMED = "unconfirmed"  # following, but the zoom camera should have shown the target for seconds and has not
     COASTING = "coasting"  # the target is out of sight for a moment; the head follows its prediction
-    LOST = "lost"  # out of sight for longer: the lens zooms out; the head goes on while the prediction is certain
+    LOST = "lost"  # out of sight for longer: the head goes on while the prediction is certain
     UNREACHABLE = "unreachable"  # the target is seen but cannot be aimed at
     STANDING = "standing"  # an operator lets head and lens stand; detection and tracks go on
     MANUAL = "manual"  # an operator moves the head or the lens by hand
@@ -284,7 +284,7 @@ class FollowSettings:
 
     Attributes:
         predict: whether to predict the target's motion; without it the head goes to where the target was seen.
-        zoom_out_after_s: how long a target may be out of sight before the lens zooms out [s].
+        lost_after_s: how long a target may be out of sight before it is lost [s].
         closed_loop: whether the target is also registered in the zoom image.
         finder: makes the finder for the zoom image; by default `CloseupFinder` with `matching`.
         tracking: image filter, association and life cycle of tracks; by default those of the target profile.
@@ -298,7 +298,7 @@ class FollowSettings:
     """
 
     predict: bool = True
-    zoom_out_after_s: float = 0.4
+    lost_after_s: float = 0.4
     closed_loop: bool = True
     finder: MakeFinder | None = None
     tracking: TrackingSettings | None = None
@@ -558,11 +558,13 @@ class HeadRun:
         """
         track = target.track
         self.count_seen_well(target, interval)
-        if t - track.seen_t > self._settings.zoom_out_after_s:
+        if t - track.seen_t > self._settings.lost_after_s:
             reason, aim = self._follow_unseen(target.estimate, track.seen_t, interval)
             return State.LOST, (f"out of sight for {t - track.seen_t:.1f} s", reason), aim
         try:
-            aim, zoom_reason = self.controller.drive(target.estimate, track.seen_t, interval, shape=track.shape)
+            aim, zoom_reason = self.controller.drive(
+                target.estimate, track.seen_t, interval, shape=track.shape, missed=track.missed > 0
+            )
         except UnreachableError as error:
             target.unreachable = True
             return State.UNREACHABLE, (str(error),), None

@@ -59,7 +59,9 @@ class Controller:
         # Logarithm of the focal length that the policy wants, and what the lens made of it.
         self._wanted_focal, self._zoomed_px = 0.0, math.nan
 
-    def drive(self, predict: Predict, seen_t: float, interval: float, *, shape: float = 1.0) -> tuple[Aim, str]:
+    def drive(
+        self, predict: Predict, seen_t: float, interval: float, *, shape: float = 1.0, missed: bool = False
+    ) -> tuple[Aim, str]:
         """Send head and lens after a target.
 
         Args:
@@ -67,6 +69,7 @@ class Controller:
             seen_t: time at which it was last seen [s].
             interval: time from one command to the next [s].
             shape: width over height of its box.
+            missed: whether the newest fixed frame does not show it; then the lens stays as it is.
 
         Returns:
             The aim at where the target will be when a command given now takes effect; and the reason for the focal
@@ -81,25 +84,7 @@ class Controller:
             self._obey(self._policy, effect_t, first, then, seen_t, interval)
             return first, "wanted"
         self._command_head(predict, effect_t, target, first, then, interval)
-        pan, tilt, focal = self.commanded
-        now = self._rig.clock.now()
-        exposed = interval + (now + self._rig.spec.zoom.delay_s)
-        (pan_then, _), (tilt_then, _) = self._head_controller.head.motion_at(exposed)
-        at_exposure = predict(exposed if self._predict else seen_t)
-        focal_px, reason = self._zoom.choose(
-            None if at_exposure is None else at_exposure.appearance(pan_then, tilt_then, focal, shape),
-            first.focal_px * then.range / first.range,
-            self._true(focal),
-            now,
-            self._true(self._rig.zoom.state().focal_px),
-            max(abs(then.pan - first.pan), abs(then.tilt - first.tilt)) / interval,
-        )
-        nominal = self._calibration.zoom_head.lens.nominal_for(focal_px)
-        if abs(math.log(nominal / focal)) > NO_CHANGE:
-            focal = self._rig.zoom.zoom(nominal)
-            self.lens_commands += 1
-        self.commanded = (pan, tilt, focal)
-        return first, reason
+        return first, "wanted" if missed else self._command_lens(predict, seen_t, first, then, interval, shape)
 
     def _obey(self, policy: OnnxPolicy, effect_t: float, first: Aim, then: Aim, seen_t: float, interval: float) -> None:
         """Send head and lens as a learnt policy wants; arguments as for `_command_head`, and when it was last seen."""
@@ -127,7 +112,7 @@ class Controller:
         self.commanded = (*self.commanded[:2], self._zoomed_px)
 
     def search(self, predict: Predict, seen_t: float, interval: float) -> Aim | None:
-        """Zoom out, and point the head where a target out of sight should be.
+        """Point the head where a target out of sight should be; the lens stays as it is.
 
         Args:
             predict: gives the target's estimate at any time [s].
@@ -141,7 +126,6 @@ class Controller:
         Raises:
             UnreachableError: no pan and tilt within the limits do it, or there is no estimate yet.
         """
-        self.zoom_out()
         effect_t, target, later = self._predict_over_lead(predict, seen_t, interval)
         first, then = self._aims(target, later)
         seen = target.appearance(first.pan, first.tilt, self._rig.zoom.focal_range[0])
@@ -205,6 +189,33 @@ class Controller:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
             self.head_commands += 1
             self.commanded = (pan, tilt, focal)
+
+    def _command_lens(
+        self, predict: Predict, seen_t: float, first: Aim, then: Aim, interval: float, shape: float
+    ) -> str:
+        """Send the lens unless it is best left alone; arguments as for `drive` and `_command_head`.
+
+        Returns:
+            The reason for the focal length.
+        """
+        pan, tilt, focal = self.commanded
+        now = self._rig.clock.now()
+        exposed = interval + (now + self._rig.spec.zoom.delay_s)
+        (pan_then, _), (tilt_then, _) = self._head_controller.head.motion_at(exposed)
+        at_exposure = predict(exposed if self._predict else seen_t)
+        focal_px, reason = self._zoom.choose(
+            None if at_exposure is None else at_exposure.appearance(pan_then, tilt_then, focal, shape),
+            first.focal_px * then.range / first.range,
+            self._true(focal),
+            now,
+            self._true(self._rig.zoom.state().focal_px),
+            max(abs(then.pan - first.pan), abs(then.tilt - first.tilt)) / interval,
+        )
+        nominal = self._calibration.zoom_head.lens.nominal_for(focal_px)
+        if abs(math.log(nominal / focal)) > NO_CHANGE:
+            self.commanded = (pan, tilt, self._rig.zoom.zoom(nominal))
+            self.lens_commands += 1
+        return reason
 
     def _lead(self, predict: Predict, effect_t: float, target: Estimate) -> Angles:
         """Compute the way of pan and tilt from a target's last measurement to its estimate at ``effect_t`` [rad].

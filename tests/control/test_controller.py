@@ -217,14 +217,15 @@ def test_a_head_that_was_halted_on_its_way_is_sent_again():
     assert rig.head.state().pan == pytest.approx(math.atan(0.5))
 
 
-def test_a_lost_target_is_looked_for_with_the_shortest_focal_length():
+def test_a_lost_target_is_looked_for_with_the_focal_length_it_had():
     rig = Rig()
     driver = controller(rig)
     driver.drive(still(0.5), 0.0, FRAME)
-    assert rig.zoomed[-1] > SHORTEST
+    zoomed = list(rig.zoomed)
+    assert zoomed[-1] == driver.commanded[2] > SHORTEST
     rig.t = 1.0
     found = driver.search(still(2.0), 0.0, FRAME)
-    assert rig.zoomed[-1] == driver.commanded[2] == SHORTEST
+    assert (rig.zoomed, driver.commanded[2]) == (zoomed, zoomed[-1])
     assert found.pan == pytest.approx(math.atan(0.2))
     assert rig.sent[-1][:2] == driver.commanded[:2] == pytest.approx((found.pan, found.tilt))
 

@@ -68,6 +68,10 @@ def test_the_lens_is_no_longer_than_the_head_can_follow():
     assert (commanded, reason) == (6000.0, "wanted")
 
 
+def test_the_lens_at_its_end_is_as_long_as_wanted():
+    assert ZoomController(RANGE, SIZE).choose(expected(0.001), 2 * RANGE[1], RANGE[1], 0.0) == (RANGE[1], "wanted")
+
+
 def test_wide_while_unsure_close_when_sure_and_out_before_it_is_lost():
     policy = ZoomController(RANGE, SIZE)
     commanded, t, way = RANGE[0], 0.0, []

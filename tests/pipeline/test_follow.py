@@ -56,7 +56,7 @@ def test_a_run_goes_on_where_it_paused():
 
 
 def test_states_from_searching_to_lost_and_back():
-    """Confirmed by the fourth detection; out of sight: coasts for 0.4 s, zooms out, forgets after as long as seen."""
+    """Confirmed by the fourth detection; out of sight: coasts for 0.4 s, is forgotten after as long as it was seen."""
     rig = FormulaRig()
     steps = run(rig, Seer(still, lambda t: 1.0 <= t < 3.0 or t >= 6.0), 8.0)
     last = 3.0 - FRAME_S
@@ -83,11 +83,14 @@ def test_states_from_searching_to_lost_and_back():
             assert "s; looked for where it should be" in step.reason
         if step.state is State.SEARCHING:
             assert step.reason == ("what is detected is not confirmed yet" if step.tracks else "nothing is detected")
-        if step.state not in (State.FOLLOWING, State.COASTING):
+        if step.state is State.SEARCHING:
             assert step.commanded[2] == SHORTEST
         assert step.t >= step.fixed.t + LATENCY - 1e-9
     zoomed = [t for t, focal in rig.zooms if focal == SHORTEST]
-    assert zoomed == [0.0, pytest.approx(found[3][1] + LATENCY)]  # once, not in every frame
+    assert zoomed == [0.0, pytest.approx(found[4][1] + LATENCY)]  # once, not in every frame
+    unseen = [step.commanded[2] for step in steps if step.state in (State.COASTING, State.LOST)]
+    assert set(unseen) == {unseen[0]}
+    assert unseen[0] > SHORTEST
     # The target stands, so that the head has no way to go, and waits once its place is not known any more.
     assert off(rig, still, 6.0) < STEP
     assert not [t for t, *_ in rig.moves if found[4][1] + LATENCY <= t < 6.0]
@@ -113,7 +116,7 @@ def test_still_target_is_centred_and_as_large_as_wanted():
 
 
 def test_head_goes_on_with_a_target_that_is_lost():
-    """Out of sight for 0.6 s at 0.2 rad/s, it goes on unseen: the wide close-up holds it, and it stays the same."""
+    """Out of sight for 0.6 s at 0.2 rad/s, it goes on unseen, as close as it was, and it stays the same."""
     rig, steps, offs = FormulaRig(), [], []
     seer = Seer(crossing, lambda t: t < 1.5 or t > 2.1)
     for step in follow(rig_of(rig), CALIBRATION, BOOK, seer, seconds=3.0):
@@ -123,7 +126,8 @@ def test_head_goes_on_with_a_target_that_is_lost():
     assert len(lost) > 3
     # A head that waits would be left behind by 0.04 rad after 0.2 s; the deadband of the widest close-up is 0.02 rad.
     assert max(offs[i] for i in lost) < 0.03
-    assert {(steps[i].commanded[2], steps[i].aim is None) for i in lost} == {(SHORTEST, False)}
+    assert {(steps[i].commanded[2], steps[i].aim is None) for i in lost} == {(rig.zooms[-1][1], False)}
+    assert rig.zooms[-1][1] > SHORTEST
     assert [state for state, _ in spans(steps)][-2:] == [State.LOST, State.FOLLOWING]
     assert len({step.target.id for step in steps if step.target}) == 1
 
