@@ -128,7 +128,7 @@ class FilterSettings:
 # Motion by the target profile's `motion`. The larger side of what flies varies from its body's length to its wingspan.
 # Of a target of which nothing is known, motion and attitude lie between a walking and a flying one's.
 MOTIONS = {
-    "standing": MotionSettings(0.5, 0.5, 0.7, 0.01, attitude_sigma=0.01, attitude_s=2.0),
+    "standing": MotionSettings(0.8, 0.3, 1.5, 0.01, attitude_sigma=0.01, attitude_s=2.0),
     "walking": MotionSettings(0.8, 0.7, 1.2, 0.04),
     "flying": MotionSettings(6.5, 5.0, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0, turns=True),
     "general": MotionSettings(2.5, 1.0, 3.0, 0.075, attitude_sigma=0.2, attitude_s=1.0),
