@@ -352,7 +352,7 @@ BY_MOTION: Mapping[str, Mapping[str, float]] = {
 }
 AUTO: Mapping[str, float] = {"confirm_score": 0.5, "confirm_travel": 0.25, "least_travel": 0.03, "start_score": 0.05}
 BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
-    "colour": {"noise_px": 0.2, "noise_of_size": 0.01},
+    "colour": {"noise_px": 0.2, "noise_of_size": 0.01, "newcomers_hz": 0.2},
     "auto": AUTO,
     "motion": AUTO,
     "speck": AUTO,
