@@ -9,6 +9,7 @@ by itself is as good as the calibration. Gates and inflations: docs/design-notes
 """
 
 import bisect
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -428,12 +429,13 @@ class TargetFilter:
 
     def without(self, begin: float, end: float) -> "TargetFilter":
         """Make a filter of the same target without the observations after ``begin`` and up to ``end`` [s]."""
-        if not any(begin < each.t <= end for each in self._observed):
+        first = bisect.bisect_right(self._observed, begin, key=lambda each: each.t)
+        if first == len(self._observed) or self._observed[first].t > end:
             return self
-        kept = TargetFilter(self._calibration, self._target, self._settings)
-        kept._base = self._base
-        for each in self._observed:
-            if not begin < each.t <= end:
+        kept = copy.copy(self)  # what was computed from the earlier ones stays
+        kept._observed, kept._nodes = self._observed[:first], self._nodes[:first]
+        for each in self._observed[first:]:
+            if each.t > end:
                 kept._insert(each)
         return kept
 
