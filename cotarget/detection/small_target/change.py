@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -28,6 +29,21 @@ LEAST_NOISE = 1.0
 NOISE_STRIDE = 8
 # Median of a normal distribution's absolute values over its standard deviation.
 MEDIAN_OF_NORMAL = 0.6745
+
+
+@dataclass(frozen=True)
+class Reference:
+    """An earlier image to compare with.
+
+    Attributes:
+        image: the image, (H, W).
+        shift: shift of the scene from now to then (du, dv) [px].
+        search: how far a match is searched [px].
+    """
+
+    image: Image
+    shift: tuple[float, float]
+    search: int
 
 
 class History:
@@ -87,14 +103,24 @@ class History:
         """Drop all images, after the scene has changed."""
         self._kept.clear()
 
-    def references(self, t: float) -> list[tuple[Image, Array] | None]:
-        """Return the image nearest to each of `AGES_S`, with its shift; None for an age without an image."""
-        found: list[tuple[Image, Array] | None] = []
+    def references(self, t: float, shift: Array) -> list[Reference | None]:
+        """Return the image nearest to each of `AGES_S` before a time [s], None for an age without one.
+
+        Args:
+            t: time of the next image [s].
+            shift: the camera's shift at that time, (2,) [px].
+        """
+        found: list[Reference | None] = []
         ages = t - np.array([kept[0] for kept in self._kept])
         for age in AGES_S:
             off = np.abs(ages - age)
-            near = off.size and off.min() <= AGE_TOLERANCE * age
-            found.append(self._kept[int(off.argmin())][1:3] if near else None)
+            if not (off.size and off.min() <= AGE_TOLERANCE * age):
+                found.append(None)
+                continue
+            _, image, shift_then, _ = self._kept[int(off.argmin())]
+            du, dv = (shift_then - shift).tolist()
+            search = min(MOST_SEARCH_PX, SEARCH_PX + round(SEARCH_PART * math.hypot(du, dv)))
+            found.append(Reference(image, (du, dv), search))
         return found
 
 
@@ -103,9 +129,8 @@ def changes(
     low: tuple[int, int],
     size: tuple[int, int],
     around: float,
-    shift: Array,
     noise: float,
-    references: Sequence[tuple[Image, Array] | None],
+    references: Sequence[Reference | None],
 ) -> list[float]:
     """Measure the part of a target's contrast that was not there before: 0 for nothing, 1 for all of it.
 
@@ -116,9 +141,8 @@ def changes(
         low: first column and row of the target's box [px].
         size: width and height of the box [px].
         around: grey level of the surroundings.
-        shift: the camera's shift now, (2,) [px].
         noise: standard deviation of the image noise [grey levels].
-        references: earlier images and the camera's shift then; None where there is none.
+        references: earlier images; None where there is none.
 
     Returns:
         The change since each; nan where there is none, and 0 if the place was not in view then, because a border that
@@ -135,18 +159,13 @@ def changes(
         if before is None:
             found.append(math.nan)
             continue
-        earlier, shift_then = before
-        du, dv = (shift_then - shift).tolist()
-        # getRectSubPix takes the centre of a patch: n pixels from column x are centred at x + (n - 1) / 2.
-        u, v = left + (w - 1) / 2 + du, top + (h - 1) / 2 + dv
-        if not all(
-            (n - 1) / 2 <= x + 0.5 and x - 0.5 <= of - (n + 1) / 2
-            for x, n, of in ((u, w, grey.shape[1]), (v, h, grey.shape[0]))
-        ):
+        x, y = left + before.shift[0], top + before.shift[1]
+        if not (-0.5 <= x <= grey.shape[1] - w + 0.5 and -0.5 <= y <= grey.shape[0] - h + 0.5):
             found.append(0.0)
             continue
-        search = min(MOST_SEARCH_PX, SEARCH_PX + round(SEARCH_PART * math.hypot(du, dv)))
-        then = cv2.getRectSubPix(earlier, (w + 2 * search, h + 2 * search), (u, v), patchType=cv2.CV_32F)
+        # getRectSubPix takes the centre of a patch: n pixels from column x are centred at x + (n - 1) / 2.
+        size, center = (w + 2 * before.search, h + 2 * before.search), (x + (w - 1) / 2, y + (h - 1) / 2)
+        then = cv2.getRectSubPix(before.image, size, center, patchType=cv2.CV_32F)
         then += np.float32(level - _level(then))  # flickering light is no change
         squared = _least(cv2.matchTemplate(then, now, cv2.TM_SQDIFF))
         found.append(max(0.0, squared - 2 * noise**2 * w * h) / energy)

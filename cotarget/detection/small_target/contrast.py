@@ -206,23 +206,25 @@ def _peaks(
 
 
 def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
-    """Mean of the ring around each pixel of an image of half the size, and the deviation from it or from a plane."""
-    total = _box_sum(half, cv2.boxFilter)
-    squares = _box_sum(half, cv2.sqrBoxFilter)
+    """Mean of the ring around each pixel of an image of half the size, and the deviation from it or from a plane.
+
+    In place, which takes a third of the time of new arrays in an image of 640 px.
+    """
     count = np.float32(OUTER_HALF_PX**2 - GUARD_HALF_PX**2)
-    mean = total / count
-    variance = squares / count - mean * mean
-    if not sloping:
-        return mean, cv2.sqrt(np.maximum(variance, np.float32(LEAST_ROUGHNESS**2)))
-    # The slope along each axis is the ring's first moment over its second moment along that axis. That of a square is
-    # n^2 (n^2 - 1) / 12.
-    outer, inner = (side**2 * (side**2 - 1) / 12 for side in (OUTER_HALF_PX, GUARD_HALF_PX))
-    moment = np.float32((outer - inner) * count)
-    for k in (0, 1):
-        first = _first_moment(half, OUTER_HALF_PX, k)
-        cv2.subtract(first, _first_moment(half, GUARD_HALF_PX, k), first)
-        variance -= first * first / moment
-    return mean, cv2.sqrt(np.maximum(variance, np.float32(LEAST_ROUGHNESS**2)))
+    mean, variance = _box_sum(half, cv2.boxFilter), _box_sum(half, cv2.sqrBoxFilter)
+    mean /= count
+    variance /= count
+    variance -= mean * mean
+    if sloping:
+        # The slope along each axis is the ring's first moment over its second moment along that axis. That of a square
+        # is n^2 (n^2 - 1) / 12.
+        outer, inner = (side**2 * (side**2 - 1) / 12 for side in (OUTER_HALF_PX, GUARD_HALF_PX))
+        moment = np.float32((outer - inner) * count)
+        for k in (0, 1):
+            first = _first_moment(half, OUTER_HALF_PX, k) - _first_moment(half, GUARD_HALF_PX, k)
+            variance -= first * first / moment
+    np.maximum(variance, np.float32(LEAST_ROUGHNESS**2), out=variance)
+    return mean, np.sqrt(variance, out=variance)
 
 
 def _box_sum(half: Image, box: Callable[..., Array]) -> Array:
@@ -254,7 +256,7 @@ def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> Small
     left, top = max(0, u - reach), max(0, v - reach)
     window = image[top : v + reach + 1, left : u + reach + 1].astype(np.float32) - np.float32(around)
     near = window[max(0, v - top - factor) : v - top + factor + 1, max(0, u - left - factor) : u - left + factor + 1]
-    j, i = (int(n) for n in np.unravel_index(int(np.argmax(np.abs(near))), near.shape))
+    j, i = divmod(int(np.abs(near).argmax()), near.shape[1])
     contrast = float(near[j, i])
     at = max(0, u - left - factor) + i, max(0, v - top - factor) + j
     # An aeroplane has bright and dark parts.

@@ -10,7 +10,7 @@ import numpy as np
 
 from cotarget.detection.base import Detections, halvings, moved
 from cotarget.detection.small_target.camera_motion import CameraMotion
-from cotarget.detection.small_target.change import AGES_S, History, changes
+from cotarget.detection.small_target.change import AGES_S, History, Reference, changes
 from cotarget.detection.small_target.contrast import (
     ALIGNED_PX,
     INNER_PX,
@@ -97,7 +97,7 @@ class SmallTargetFinder:
         if self.camera.jumped:
             self._history.clear()
             self._warm_up_s = AFTER_CUT_S
-        references = self._history.references(frame.t)
+        references = self._history.references(frame.t, shift)
         self.repeated = not self._history.add(frame.t, grey, shift, exposure)
         if self.repeated or self._history.span < self._warm_up_s:
             return [], Detections([], functools.partial(_mask, [], frame.image.shape, times))
@@ -110,7 +110,7 @@ class SmallTargetFinder:
         for target in [*find_wholes(grey, unit), *small]:
             low = target.low[0] // unit, target.low[1] // unit
             size = -(-target.size[0] // unit), -(-target.size[1] // unit)
-            since = changes(grey, low, size, target.around, shift, self._history.noise, references)
+            since = changes(grey, low, size, target.around, self._history.noise, references)
             target = replace(target, since=tuple(since))
             score = small_target_score(target.signal, since, target.beside, self._weights)
             detection = _boxed(target, score, shape, times)
@@ -118,7 +118,7 @@ class SmallTargetFinder:
                 found.append((target, detection))
             if detection.score >= ARRIVED and np.nanmax(since) >= ARRIVED:
                 arrived.append((target, detection))
-        differing = self._differing(frame.t, grey, unit, times, shift, references)
+        differing = self._differing(frame.t, grey, unit, times, references)
         found += [_as_a_whole(pair, arrived) for pair in differing]
         arrived.sort(key=lambda pair: -math.prod(pair[0].size))
         wholes = _apart([pair for pair in arrived if pair[0].whole], mostly_in)
@@ -136,20 +136,19 @@ class SmallTargetFinder:
         grey: Image,
         unit: int,
         times: int,
-        shift: Array,
-        references: list[tuple[Image, Array] | None],
+        references: Sequence[Reference | None],
     ) -> list[Found]:
         """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
 
         The difference of an image enlarged by a factor ``times`` is halved: a twig sways over more of its pixels.
         """
         earlier = [kept for kept in references if kept is not None]
-        if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > times * SHAKING_PX for _, then in earlier):
+        if len(earlier) < FEWEST_EARLIER or max(abs(du) for kept in earlier for du in kept.shift) > times * SHAKING_PX:
             self._usual = None
             return []
         registered = (
-            picture if np.abs(shift - then).max() <= STANDING_PX else moved(picture, shift - then)
-            for picture, then in earlier
+            kept.image if max(map(abs, kept.shift)) <= STANDING_PX else moved(kept.image, -np.array(kept.shift))
+            for kept in earlier
         )
         difference = functools.reduce(cv2.min, (cv2.absdiff(grey, picture) for picture in registered))
         pixel = unit  # side of a pixel of the difference

@@ -57,10 +57,8 @@ def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
     mask = cv2.compare(off, TIMES * usual, cv2.CMP_GT)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
     found = []
-    for contour in cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
-        x, y, w, h = cv2.boundingRect(contour)
-        if unit * max(w, h) < LEAST_PART * width:
-            continue
+    boxes = cv2.connectedComponentsWithStats(mask)[2][1:, :4]  # the first is the background
+    for x, y, w, h in boxes[unit * boxes[:, 2:].max(axis=1) >= LEAST_PART * width].tolist():
         contrast = float(sharp[y : y + h, x : x + w].max())
         body = sharp[y : y + h, x : x + w] > max(TIMES * usual, FAINTEST * contrast)
         dx, dy, w, h = cv2.boundingRect(body.astype(np.uint8))
