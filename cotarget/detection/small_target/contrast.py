@@ -17,14 +17,13 @@ from cotarget.rig import Image
 INNER_PX = 3
 # Inner and outer side of the ring, in pixels of an image of half the size: 14 and 22 px. The target lies inside.
 GUARD_HALF_PX, OUTER_HALF_PX = 7, 11
-# Scales, for targets of up to 12 px to those of up to 100; in the difference, of up to 50.
-SCALES, SCALES_OF_DIFFERENCE = 4, 3
-# How far the largest ring of the difference reaches, and the side of a pixel of its largest scale [px].
-REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES_OF_DIFFERENCE, 2**SCALES_OF_DIFFERENCE
+# Scales, for targets of up to 12 px to those of up to 50. Outlines are found in images that are at most as many scales
+# finer, which bounds the window's size.
+SCALES = 3
+# How far the largest ring reaches, and the side of a pixel of the image in which it is measured [px].
+REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES, 2**SCALES
 # Most regions found, and most examined at each scale, the strongest first; bounds the computing time.
 MOST_TARGETS = 40
-# First scale whose ring, 90 px, is so large that a sky's gradient counts.
-SLOPING_SCALE = 2
 # Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
 LEAST_ROUGHNESS = 1.5
 # Factor by which the roughness of the surroundings counts where targets of one or two pixels are searched, in the mean
@@ -34,10 +33,8 @@ SMALLEST_TIMES = 2.0
 BESIDE, BESIDE_PX = 2.0, 6.0
 # Part of the contrast at which a target's outline lies.
 OUTLINE = 0.33
-# Scale at which texture is measured, and the window of the mean that a pixel is compared with for it [px].
-TEXTURE_SCALE, TEXTURE_PX = 2, (5, 5)
-# Outlines are found this many scales finer than the peak, which bounds the window's size.
-WINDOW_SCALES = 3
+# Window of the mean that a pixel of the coarsest scale is compared with, which measures texture [px].
+TEXTURE_PX = (5, 5)
 
 
 @dataclass(frozen=True)
@@ -81,18 +78,15 @@ def find_small_targets(
         of_difference: whether the image is a difference of two, in which dark regions and texture mean nothing.
     """
     levels, first = [*finer, grey], len(finer)
-    texture: Image | None = None
+    coarsest = first + SCALES - 1
     peaks: list[_Peak] = []
-    for scale in range(first, first + (SCALES_OF_DIFFERENCE if of_difference else SCALES)):
+    for scale in range(first, coarsest + 1):
         level = levels[scale]
         if min(level.shape) < 2 * OUTER_HALF_PX:
             break
         levels.append(cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         above = levels[scale - 1] if scale == first and first else None
-        sloping, finest = scale - first >= SLOPING_SCALE, scale == 0 and not of_difference
-        peaks += _peaks(level, levels[-1], scale, sloping, threshold, above, finest)
-        if scale - first == TEXTURE_SCALE and not of_difference:
-            texture = cv2.absdiff(level, cv2.blur(level, TEXTURE_PX))
+        peaks += _peaks(level, levels[-1], scale, threshold, above, scale == 0 and not of_difference)
     peaks.sort(key=lambda peak: -peak.signal)
     kept: list[SmallTarget] = []
     for peak in peaks:
@@ -104,14 +98,16 @@ def find_small_targets(
             kept.append(target)
             if len(kept) == MOST_TARGETS:
                 break
-    if texture is None:
+    if of_difference or len(levels) <= coarsest + 1:  # a small image is not searched at all scales
         return kept
-    return [replace(target, beside=_beside(texture, target, 2 ** (first + TEXTURE_SCALE))) for target in kept]
+    texture = cv2.absdiff(levels[coarsest], cv2.blur(levels[coarsest], TEXTURE_PX))
+    return [replace(target, beside=_beside(texture, target, 2**coarsest)) for target in kept]
 
 
 def _contains(target: SmallTarget, at: tuple[float, float]) -> bool:
     """Whether a target's box contains a place [px]."""
-    return all(low <= x < low + size for low, size, x in zip(target.low, target.size, at, strict=True))
+    (x, y), (w, h) = target.low, target.size
+    return x <= at[0] < x + w and y <= at[1] < y + h
 
 
 def _beside(texture: Image, target: SmallTarget, unit: int) -> float:
@@ -151,7 +147,6 @@ def _peaks(
     level: Image,
     half: Image,
     scale: int,
-    sloping: bool,
     threshold: float,
     finer: Image | None = None,
     finest: bool = False,
@@ -162,12 +157,11 @@ def _peaks(
         level: image at this scale, (H, W).
         half: the same in half the size.
         scale: number of halvings.
-        sloping: whether to fit a plane to the ring, which is so large that a sky's gradient counts.
         threshold: least contrast, in standard deviations of the surroundings.
         finer: image of twice the size in which targets of one or two pixels are searched too; None for none.
         finest: whether these are searched in this image instead.
     """
-    mean, deviation = _ring(half, sloping)
+    mean, deviation = _ring(half)
     size = (level.shape[1], level.shape[0])
     blurred = cv2.boxFilter(level, -1, (INNER_PX, INNER_PX))
     searched = [(blurred, blurred, deviation)]  # darkest and brightest around each pixel, roughness of the surroundings
@@ -205,8 +199,8 @@ def _peaks(
     return peaks[:MOST_TARGETS]
 
 
-def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
-    """Mean of the ring around each pixel of an image of half the size, and the deviation from it or from a plane.
+def _ring(half: Image) -> tuple[Array, Array]:
+    """Mean and deviation of the ring around each pixel of an image of half the size.
 
     In place, which takes a third of the time of new arrays in an image of 640 px.
     """
@@ -215,14 +209,6 @@ def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
     mean /= count
     variance /= count
     variance -= mean * mean
-    if sloping:
-        # The slope along each axis is the ring's first moment over its second moment along that axis. That of a square
-        # is n^2 (n^2 - 1) / 12.
-        outer, inner = (side**2 * (side**2 - 1) / 12 for side in (OUTER_HALF_PX, GUARD_HALF_PX))
-        moment = np.float32((outer - inner) * count)
-        for k in (0, 1):
-            first = _first_moment(half, OUTER_HALF_PX, k) - _first_moment(half, GUARD_HALF_PX, k)
-            variance -= first * first / moment
     np.maximum(variance, np.float32(LEAST_ROUGHNESS**2), out=variance)
     return mean, np.sqrt(variance, out=variance)
 
@@ -231,13 +217,6 @@ def _box_sum(half: Image, box: Callable[..., Array]) -> Array:
     """Sum of the image, or of its squares, over the ring around each pixel."""
     total = box(half, cv2.CV_32F, (OUTER_HALF_PX,) * 2, normalize=False)
     return cv2.subtract(total, box(half, cv2.CV_32F, (GUARD_HALF_PX,) * 2, normalize=False), total)
-
-
-def _first_moment(half: Image, side: int, axis: int) -> Array:
-    """Sum over a square of the image times the distance from its middle along an axis (0: columns)."""
-    kernels = [np.ones(side, np.float32)] * 2
-    kernels[axis] = np.arange(side, dtype=np.float32) - side // 2
-    return np.asarray(cv2.sepFilter2D(half, cv2.CV_32F, kernels[0], kernels[1]))
 
 
 def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> SmallTarget | None:
@@ -249,7 +228,7 @@ def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> Small
         of_difference: whether the target is brighter than its surroundings in all its parts, as in a difference.
     """
     scale, around = peak.scale, peak.around
-    fine = max(0, scale - WINDOW_SCALES)
+    fine = max(0, scale - SCALES)
     image, factor, unit = levels[fine], 2 ** (scale - fine), 2**fine
     u, v = factor * peak.u + factor // 2, factor * peak.v + factor // 2
     reach = factor * GUARD_HALF_PX
@@ -279,4 +258,5 @@ def mostly_in(part: SmallTarget, whole: SmallTarget) -> bool:
 
 def share(one: SmallTarget, other: SmallTarget) -> bool:
     """Whether the boxes of two regions overlap."""
-    return all(a < b + n and b < a + m for a, m, b, n in zip(one.low, one.size, other.low, other.size, strict=True))
+    (x, y), (w, h), (u, v), (m, n) = one.low, one.size, other.low, other.size
+    return x < u + m and u < x + w and y < v + n and v < y + h
