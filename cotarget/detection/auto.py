@@ -20,25 +20,23 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.detection.background import WIDE, WIDEST_PX, LargeTargetFinder
-from cotarget.detection.base import LASTING_S, Detections, SizeCheck, Tracks, halvings
+from cotarget.detection.base import LASTING_S, QUIET_PART, Detections, SizeCheck, Tracks, halvings
 from cotarget.detection.exposure import Exposure
 from cotarget.detection.small_target import WEIGHTS, SmallTarget, SmallTargetFinder, Weights
 from cotarget.geometry import Array, intersection_areas
 from cotarget.rig import Detection, Frame, Image
 
-# In parts of the image's width: most that a camera shakes, more is a pan; shift at which the background is learnt
-# again, because too much of it is out of view; and least shift that counts.
-SHAKE_PART, VIEW_PART, QUIET_PART = 3 / 640, 0.1, 0.5 / 640
+# In parts of the image's width: most that a camera shakes, more is a pan; and shift at which the background is learnt
+# again, because too much of it is out of view.
+SHAKE_PART, VIEW_PART = 3 / 640, 0.1
 # Largest texture beside a target before a plain background [grey levels].
 PLAIN = 5.0
-# Part of a large target that a small one covers if they are the same target; one of which the large target covers less
-# than 1 - SAME is much larger.
-SAME = 0.6
+# Part of a large target that a small one covers if they are the same target, of a small one that is a part of a large
+# one, and of a small one that is much larger: less than this is covered.
+SAME = 0.5
 # Targets and tracks are alike if their larger sides differ by less than this factor. A small target that one follows
 # is no part of a large one whose area is larger by more than the square, but a bird before a cloud.
 SIDE_RATIO = 2.0
-# Part of a small target inside a large one from which it is a part of it.
-INSIDE = 0.5
 # Time for which the background under a confirmed track is not learnt, from when the track last moved by its size [s].
 HELD_S = 60.0
 # Margin around what is held: in parts of its size, and in parts of the image's width.
@@ -49,8 +47,6 @@ SHAPE_SIGMA, OTHER_SIGMA, OTHER_PART = 0.5, 1.0, 0.2
 # Clutter: number of cells along the image's width, memory [s], and what halves a target's odds: the usual score at its
 # place, and the sum of the scores of others of its size, as of raindrops.
 CELLS, CLUTTER_S, CLUTTER_EVEN, CROWD_EVEN = 80, 10.0, 0.03, 3.0
-# Largest weight of one image in the clutter map: the first after a pause does not empty it.
-MOST_GAIN = 0.1
 
 
 class AutoDetector:
@@ -144,7 +140,6 @@ class AutoDetector:
             self._begun, off = shift, np.zeros(2)
             self._large_finder.forget()
             self._clutter.forget()
-        # Less than a quarter of a pixel of the reduced image is no shift but noise.
         off = off if np.abs(off).max() > QUIET_PART * width else np.zeros(2)
         steady = all(np.abs(shift - before).max() <= SHAKE_PART * width for _, before in self._shifts)
         return off if steady else None
@@ -233,7 +228,7 @@ class Clutter:
                 even = each.score / (1 + float(self._usual[v, u]) / CLUTTER_EVEN + crowd / CROWD_EVEN)
                 each = replace(each, score=even / (even + 1 - each.score))
             weighed.append(each)
-        self._usual += np.clip((t - self._t) / CLUTTER_S, 0.0, MOST_GAIN) * (now - self._usual)
+        self._usual += np.clip((t - self._t) / CLUTTER_S, 0.0, 1.0) * (now - self._usual)
         self._t = t
         return weighed
 
@@ -266,15 +261,15 @@ def fuse(
             for each, plain in zip(small, outlined, strict=True)
             if _covered(whole, each) > SAME and like(each) >= like(whole)
         ]
-        if any(plain or _covered(each, whole) < 1 - SAME for each, plain in same):
+        if any(plain or _covered(each, whole) < SAME for each, plain in same):
             continue
-        inside = [each for each, plain in zip(small, outlined, strict=True) if plain and _covered(each, whole) > INSIDE]
+        inside = [each for each, plain in zip(small, outlined, strict=True) if plain and _covered(each, whole) > SAME]
         if any(SIDE_RATIO**2 * each.size_px.prod() > whole.size_px.prod() for each in inside):
             continue  # the rest of it is the place that the target has left
         parts = [
             each
             for each, own in zip(small, followed, strict=True)
-            if (_covered(each, whole) > INSIDE or _covered(whole, each) > SAME)
+            if (_covered(each, whole) > SAME or _covered(whole, each) > SAME)
             and not (own and SIDE_RATIO**2 * each.size_px.prod() < whole.size_px.prod())
         ]
         found = [each for each in found if not any(each is part for part in parts)]

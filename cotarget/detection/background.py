@@ -25,8 +25,6 @@ from cotarget.detection.base import (
 from cotarget.geometry import Array
 from cotarget.rig import Detection, Frame, Image
 
-# Shift of the scene before a camera that stands [px].
-STANDING = np.zeros(2)
 # Images are halved until they are at most this wide [px]; the lengths below are in pixels of the result.
 WIDEST_PX = 480
 # The mixture: its memory, and the interval at which the background is learnt beside what is held and its image is read,
@@ -51,9 +49,9 @@ EDGE_PX = 1
 SOFT_PX, CONTRAST_PART, SLOPE_PART = 4.0, 0.9, 0.98
 # Largest edge in the image over that in the background, where a target has left.
 GHOST = 0.7
-# Light: most by which the sun brightens the ground; part of the image up to which foreground is too little for a change
-# of light; and part of what is held from which light explains it, so that it is no target but lit ground.
-BRIGHTEST, FEW, LIT = 1.5, 0.01, 0.8
+# Light: most by which sun or exposure brighten the ground, and part of the image up to which foreground is too little
+# for a change of light.
+BRIGHTEST, FEW = 1.5, 0.01
 # Margin beside the background's colour [grey levels]: five standard deviations of a sensor's noise of 2, and coding.
 MARGIN = 15
 
@@ -84,7 +82,7 @@ class LargeTargetFinder:
         self,
         frame: Frame,
         places: Sequence[tuple[Array, Array]] = (),
-        shift_px: Array = STANDING,
+        shift_px: Array | None = None,
         exposure: float = 1.0,
         images: Sequence[Image] | None = None,
     ) -> Detections:
@@ -93,12 +91,14 @@ class LargeTargetFinder:
         Args:
             frame: frame of the camera.
             places: centre and size of places whose background is not learnt, (2,) each [px].
-            shift_px: shift of the scene since the background was begun (du, dv) [px], (2,).
+            shift_px: shift of the scene since the background was begun (du, dv) [px], (2,); None for a camera that
+                stands.
             exposure: relative brightness of the image, which is undone.
             images: the frame's image and its halvings to `WIDEST_PX`, where they are made already.
         """
         images = images or halvings(frame.image, WIDEST_PX)
         factor = 2 ** (len(images) - 1)
+        shift_px = np.zeros(2) if shift_px is None else shift_px
         shift = shift_px / factor
         image = moved(np.asarray(cv2.convertScaleAbs(images[-1], alpha=1 / exposure), dtype=np.uint8), -shift)
         mask = self._subtract(image, frame.t, _reduced_boxes(places, shift_px, factor))
@@ -208,7 +208,7 @@ class LargeTargetFinder:
         free = mask.copy()
         lit.ravel()[there[same]] = FOREGROUND
         for box in held:
-            if cv2.countNonZero(lit[box]) < LIT * cv2.countNonZero(mask[box]):
+            if 2 * cv2.countNonZero(lit[box]) < cv2.countNonZero(mask[box]):  # it is a target and no lit ground
                 free[box] = 0
         count = cv2.countNonZero(free)
         explained = count >= FEW * mask.size and 2 * cv2.countNonZero(cv2.bitwise_and(free, lit)) > count

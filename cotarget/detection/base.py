@@ -28,6 +28,8 @@ Tracks = Sequence["Track"]
 FOREGROUND = 255
 # Largest part of foreground that may be targets; beyond it, the light or the camera has changed.
 MOST_FOREGROUND = 0.45
+# Shift of a camera up to which it stands, because its measurement has that noise [parts of the image's width].
+QUIET_PART = 0.5 / 640
 # Time for which a picture must be another, or a camera must stand, before it counts: a flash is shorter [s].
 LASTING_S = 0.2
 

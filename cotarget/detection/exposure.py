@@ -5,17 +5,16 @@ import math
 import cv2
 import numpy as np
 
-from cotarget.detection.background import HISTORY_S
+from cotarget.detection.background import BRIGHTEST, HISTORY_S
 from cotarget.detection.base import LASTING_S
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
 # Cells along width and height in which brightness is compared.
 CELLS = (32, 24)
-# Deviation of a cell from the common change up to which it agrees, and least part of the cells that do; and the range
-# of the change. Beyond these, the picture has changed and not the exposure.
-AGREEMENT, FEWEST = 0.1, 0.5
-DARKEST, BRIGHTEST = 1 / 3, 1.5
+# Deviation of a cell from the common change up to which it agrees, least part of the cells that do, and least change.
+# Beyond these, the picture has changed and not the exposure.
+AGREEMENT, FEWEST, DARKEST = 0.1, 0.5, 1 / 3
 # Images are compared if their exposures differ by at most this part, because a codec draws texture again; time over
 # which exposures are averaged for it, so that a lamp may flicker and a cloud pass [s].
 SAME_EXPOSURE, AVERAGED_S = 0.02, 0.5

@@ -75,8 +75,6 @@ BEAT_PART = 0.9
 WHOLE_S = 2.0
 # Largest part of the travel in one step; beyond it the outline jumped to that of another thing.
 LARGEST_STEP = 2 / 3
-# A shorter step is no jump: outlines consist of whole pixels and flicker [px].
-LEAST_JUMP_PX = 3.0
 Edges = tuple[float, float]
 
 
@@ -220,7 +218,7 @@ class Trail:
         count = max(1, min(3, len(edges) // 3))  # medians of three, because outlines flicker
         way = _common_motion(edges[:count], edges[-count:])
         longest = max(steps[1:], default=0.0)
-        return way if longest <= max(LARGEST_STEP * way, LEAST_JUMP_PX) else 0.0
+        return way if longest <= LARGEST_STEP * way else 0.0
 
 
 def _edges(center: float, size: float, extent: int | None, clipped: bool) -> Edges:

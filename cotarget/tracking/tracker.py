@@ -27,8 +27,8 @@ from cotarget.tracking.track import (
 __all__ = ["Track", "Tracker", "TrackingSettings", "tracking_settings"]
 # Cost of pairs that must not be matched; no assignment inside the gate reaches it.
 IMPOSSIBLE = 1e6
-# What lies to this part in a confirmed track's box, enlarged by a factor, belongs to it: a shoe, a rotor.
-PART, NEAR = 0.5, 1.5
+# What is covered by a confirmed track's box, enlarged by this factor, belongs to it: a shoe, a rotor.
+NEAR = 1.5
 # A box around a track begins another one if its area is larger by this factor: it may be a flock around a bird.
 LARGER = 4.0
 
@@ -166,7 +166,7 @@ class Tracker:
         confirmed = [state for state in self._tracks if state.confirmed]
         wholes = np.array([state.whole for state in confirmed]).reshape(-1, 2)
         near = intersection_areas(_boxes_of(confirmed)[0], NEAR * wholes, center, extent)
-        free &= np.all(near <= PART * _area(extent), axis=0)
+        free &= np.all(near <= covered * _area(extent), axis=0)
         covers = intersection_areas(center, extent, center, extent) > covered * _area(extent)[:, None]
         for j, detection in enumerate(detections):
             if free[j]:  # detections that cover this new track are no further target

@@ -24,9 +24,9 @@ FEWEST = 8
 SPREAD = 0.144
 # Fewest corners, where there were too few before, that show another scene.
 MANY = 24
-# If less than the first part of the corners is found again, or less than the second part of these at one shift, the
-# film was cut or the camera was moved. Standing corners count as the scene's from the second part on.
-FOUND_AGAIN, FEWEST_ALIKE = 0.3, 0.35
+# If less than this part of the corners is found again, or of these at one shift, the film was cut or the camera was
+# moved. Standing corners count as the scene's from this part on.
+FEWEST_ALIKE = 0.35
 # Fewest corners that stand and look the same, by this mean difference [grey levels], where the film goes on: a large
 # target before plain ground has the others. After a cut none do, but those of writing.
 FEWEST_STANDING, SAME_PLACE = 5, 12.0
@@ -103,7 +103,7 @@ class CameraMotion:
         farther = _spread(self._corners[standing], before) > _spread(self._corners[alike], before)
         if farther and standing.sum() >= fewest:
             alike = standing
-        if kept.mean() < FOUND_AGAIN or alike.sum() < fewest:
+        if kept.mean() < FEWEST_ALIKE or alike.sum() < fewest:
             as_before = kept & _alike(flow, np.zeros(2)) & (error.ravel() < SAME_PLACE)
             self.jumped, self._begun_t = as_before.sum() < FEWEST_STANDING, -math.inf
             return

@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detections, halvings, moved
+from cotarget.detection.base import QUIET_PART, Detections, halvings, moved
 from cotarget.detection.small_target.camera_motion import CameraMotion
 from cotarget.detection.small_target.change import AGES_S, History, Reference, changes
 from cotarget.detection.small_target.contrast import (
@@ -40,9 +40,8 @@ ARRIVED = 0.5
 LEAST_DIFFERENCE, EVEN_DIFFERENCE = 7.0, 12.0
 # Fewest of the AGES_S for which there must be an image.
 FEWEST_EARLIER = 3
-# Shift of the camera between two images up to which they are subtracted as they are, and up to which after they are
-# registered [px].
-STANDING_PX, SHAKING_PX = 0.5, 5.0
+# Shift of the camera between two images up to which they are subtracted [px].
+SHAKING_PX = 5.0
 # Usual difference, such as of a swaying branch, subtracted from the difference: its factor, the time constant of its
 # mean [s], and the width over which it spreads [px].
 USUAL_TIMES, USUAL_S, SWAY_PX = 3.0, 2.0, 5
@@ -116,7 +115,7 @@ class SmallTargetFinder:
             detection = _boxed(target, score, shape, times)
             if detection.score >= self._least_score:
                 found.append((target, detection))
-            if detection.score >= ARRIVED and np.nanmax(since) >= ARRIVED:
+            if detection.score >= ARRIVED and any(change >= ARRIVED for change in since):
                 arrived.append((target, detection))
         differing = self._differing(frame.t, grey, unit, times, references)
         found += [_as_a_whole(pair, arrived) for pair in differing]
@@ -143,12 +142,13 @@ class SmallTargetFinder:
         The difference of an image enlarged by a factor ``times`` is halved: a twig sways over more of its pixels.
         """
         earlier = [kept for kept in references if kept is not None]
-        if len(earlier) < FEWEST_EARLIER or max(abs(du) for kept in earlier for du in kept.shift) > times * SHAKING_PX:
+        shifts = [max(map(abs, kept.shift)) for kept in earlier]
+        if len(earlier) < FEWEST_EARLIER or max(shifts) > times * SHAKING_PX:
             self._usual = None
             return []
         registered = (
-            kept.image if max(map(abs, kept.shift)) <= STANDING_PX else moved(kept.image, -np.array(kept.shift))
-            for kept in earlier
+            kept.image if shift <= QUIET_PART * grey.shape[1] else moved(kept.image, -np.array(kept.shift))
+            for kept, shift in zip(earlier, shifts, strict=True)
         )
         difference = functools.reduce(cv2.min, (cv2.absdiff(grey, picture) for picture in registered))
         pixel = unit  # side of a pixel of the difference

@@ -18,8 +18,8 @@ Box = tuple[int, int, int, int]  # left, top, width and height [px]
 # Image in which the background is found, in which regions are found, and the least larger side of a region, in parts of
 # the image's width.
 COARSE_PART, FINE_PART, LEAST_PART = 8 / 640, 2 / 640, 40 / 640
-# Side of the median's window, and most that a region covers, in parts of the image's width.
-WINDOW_PART, MOST_PART = 0.5, 0.8
+# Side of the median's window, in parts of the image's width.
+WINDOW_PART = 0.5
 # Least difference from the background: in usual differences, and in grey levels.
 TIMES, LEAST_LEVELS = 4.0, 3.0
 # Least difference of a region's parts, over its largest one. If anything beside it differs by more, it is no whole: a
@@ -63,7 +63,7 @@ def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
         body = sharp[y : y + h, x : x + w] > max(TIMES * usual, FAINTEST * contrast)
         dx, dy, w, h = cv2.boundingRect(body.astype(np.uint8))
         x, y = x + dx, y + dy
-        if not LEAST_PART * width <= unit * max(w, h) <= MOST_PART * width:
+        if unit * max(w, h) < LEAST_PART * width:
             continue
         margin = max(2, max(w, h) // 4)
         left, top = max(0, x - margin), max(0, y - margin)
