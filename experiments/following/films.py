@@ -60,7 +60,8 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FLYERS = ("flyers", "birds")  # folders there whose films are all of flyers
 DIVISION, LABELS = Path(__file__).with_name("film_division.csv"), Path(__file__).with_name("film_labels")
 # Flyers of these films that have no label, found by looking at every false track: a box about every fifth frame. One is
-# listed while it is seen to fly, not where it is lost among twigs.
+# listed while it is seen to fly, in the film or in its difference from the median of the frames around, not where it is
+# lost among twigs.
 UNLABELLED = Path(__file__).with_name("unlabelled_flyers.csv")
 VTEST = Path(__file__).resolve().parents[2] / "tests" / "data" / "vtest.txt"
 # The films without flyers, and their targets.
