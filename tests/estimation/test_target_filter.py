@@ -201,6 +201,20 @@ def test_any_permutation_of_the_measurements_gives_the_same_estimate(kind):
             np.testing.assert_allclose(b.state_covariance, a.state_covariance, rtol=0, atol=SAME)
 
 
+def test_a_filter_without_some_observations_is_one_that_never_saw_them():
+    flight = Flight("person", 300, 1.2)
+    every, few = (TargetFilter(flight.calibration, flight.target) for _ in range(2))
+    begin, end = flight.times[8], flight.times[14]
+    for t, measure in measurements(flight):
+        assert measure(every)
+        assert begin < t <= end or measure(few)
+    before = every.estimate(1.3).state
+    left = every.without(begin, end)
+    assert left.estimate(1.3).state == pytest.approx(few.estimate(1.3).state, rel=SAME)
+    assert np.abs(left.estimate(1.3).state - before).max() > SAME
+    np.testing.assert_array_equal(every.estimate(1.3).state, before)  # itself it has not changed
+
+
 def test_reading_changes_nothing():
     flight = Flight("bird", 1, 2.0)
     read, unread = (TargetFilter(flight.calibration, flight.target) for _ in range(2))
