@@ -22,8 +22,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from os import environ
 from typing import Annotated, NamedTuple
-from urllib.parse import urlsplit
+from urllib.parse import urlsplit, urlunsplit
 from xml.etree.ElementTree import Element
+from xml.sax.saxutils import escape
 
 from cotarget.drivers.axes import AXES, AxisFacts, Poll
 from cotarget.drivers.guardian import StopOrder
@@ -34,6 +35,7 @@ from cotarget.drivers.ptz import Dome, PtzLink, PtzSettings, lens_positions
 from cotarget.drivers.soap import (
     DEVICE,
     DEVICE_PATH,
+    EmptyAnswerError,
     FaultError,
     LoginFaultError,
     SoapClient,
@@ -205,10 +207,20 @@ def _finite(text: str | None) -> float | None:
 
 def seconds(text: str) -> float:
     """Convert a duration of XML such as "PT1M30.5S" to seconds; 0 for what is none."""
-    found = re.fullmatch(r"P(?:(\d+)D)?(?:T(?:(\d+)H)?(?:(\d+)M)?(?:(\d+(?:\.\d+)?)S)?)?", text)
+    found = re.fullmatch(r"P(?:0+Y)?(?:0+M)?(?:(\d+)D)?(?:T(?:(\d+)H)?(?:(\d+)M)?(?:(\d+(?:\.\d+)?)S)?)?", text)
     if found is None:
         return 0.0
     return sum(float(part or 0) * unit for part, unit in zip(found.groups(), (86400, 3600, 60, 1), strict=True))
+
+
+def path_of(address: str) -> str:
+    """Return path and query of a service's address.
+
+    Raises:
+        ValueError: it is none.
+    """
+    parts = urlsplit(address)
+    return urlunsplit(("", "", parts.path or DEVICE_PATH, parts.query, ""))
 
 
 def status_of(root: Element, t: float) -> Status:
@@ -294,7 +306,7 @@ class OnvifDevice:
             self.model = quote(" ".join(filter(None, names))) or "a device"
             media, self._ptz = self._services()
             self.profile, self.configuration = self._find_profile(media)
-            token = f"<ConfigurationToken>{self.configuration.get('token', '')}</ConfigurationToken>"
+            token = f"<ConfigurationToken>{escape(self.configuration.get('token', ''))}</ConfigurationToken>"
             found = abilities_of(self._ask_if_able(self._ptz, PTZ, "GetConfigurationOptions", token))
             self.abilities = replace(found, spaces=self._node_spaces() | dict(found.spaces))
             self.url = settings.url or self._stream_address(media)
@@ -313,8 +325,9 @@ class OnvifDevice:
         return status_of(root, now - min((now - begin) / 2, LATEST_S) - self._settings.status_delay_s)
 
     def command(self, message: str, inner: str, timeout: float = COMMAND_S) -> None:
-        """Send a command; raises as `SoapClient.call` does."""
-        self._ask(self._ptz, PTZ, message, self._token + inner, timeout)
+        """Send a command; raises as `SoapClient.call` does. Some devices answer with success alone."""
+        with contextlib.suppress(EmptyAnswerError):
+            self._ask(self._ptz, PTZ, message, self._token + inner, timeout)
 
     def order(self, message: str, inner: str) -> StopOrder:
         """Write a command for a `Guardian`."""
@@ -324,7 +337,7 @@ class OnvifDevice:
 
     @property
     def _token(self) -> str:
-        return f"<ProfileToken>{self.profile}</ProfileToken>"
+        return f"<ProfileToken>{escape(self.profile)}</ProfileToken>"
 
     def _ask(self, path: str, namespace: str, message: str, inner: str = "", timeout: float = ASK_S) -> Element:
         return self.soap.call(path, namespace, message, inner, timeout)
@@ -347,7 +360,7 @@ class OnvifDevice:
             soap = SoapClient(self._address, settings.user, password, self._remedy)
             try:
                 soap.call(DEVICE_PATH, DEVICE, "GetSystemDateAndTime", timeout=ASK_S)
-            except LoginFaultError:  # it wants a user even for its time
+            except FaultError:  # it is the device: it wants a user even for its time, or does not say it
                 return soap
             except DeviceError as error:
                 soap.close()
@@ -373,8 +386,12 @@ class OnvifDevice:
             )
         namespace = MEDIA2 if MEDIA2 in where and MEDIA not in where else MEDIA
         # Behind a router or a proxy a device gives an address that leads nowhere from here.
-        media, ptz = (urlsplit(address).path or DEVICE_PATH for address in (where.get(namespace, ""), ptz))
-        return Media(media, namespace), ptz
+        try:
+            return Media(path_of(where.get(namespace, "")), namespace), path_of(ptz)
+        except ValueError as error:
+            raise DeviceError(
+                f"{self.name} ({self.model}) names addresses of services that are none: {error}"
+            ) from None
 
     def _capabilities(self) -> dict[str, str]:
         """Return the addresses of services by GetCapabilities, which some devices lack."""

@@ -60,6 +60,10 @@ class LoginFaultError(FaultError):
     """The device refuses the user, or that this user does this."""
 
 
+class EmptyAnswerError(DeviceError):
+    """The device answered with success and nothing else."""
+
+
 # XML
 
 
@@ -202,6 +206,7 @@ class SoapClient:
             LoginFaultError: the user is refused; the message says how far off the device's clock is.
             FaultError: the device answered with a fault.
             SilentError: there was no whole answer in time.
+            EmptyAnswerError: the answer is empty, and its status success.
             DeviceError: the device cannot be reached, or the answer is none.
         """
         deadline = time.monotonic() + timeout
@@ -231,7 +236,7 @@ class SoapClient:
         try:
             root, found = self._post(DEVICE_PATH, DEVICE, "GetSystemDateAndTime", "", "", deadline)
             found = device_time(root) or found
-        except LoginFaultError:
+        except FaultError:
             found = self._date
         # Devices say whole seconds.
         return 0.0 if found is None else (found - datetime.now(UTC)).total_seconds() + 0.5
@@ -277,13 +282,22 @@ class SoapClient:
                 while True:  # here, since the client would read the answer to a refused request without our limits
                     left_s = max(deadline - time.monotonic(), 0.05)
                     request.extensions["timeout"] = httpx.Timeout(left_s, connect=min(CONNECT_S, left_s)).as_dict()
-                    response = self._client.send(request, stream=True)
+                    response = self._send(request, message)
                     with contextlib.closing(response):
                         said = self._read(response, message, deadline)
                     if self._client.is_closed:  # its pool does not know a connection that was made meanwhile
                         response.extensions["network_stream"].close()
                     request = steps.send(response)
         self._date = _date(response.headers)
+        if response.is_success and not said.strip():
+            raise EmptyAnswerError(
+                f"{self.name} answers {message} by nothing: check that ONVIF is on, and host and port"
+            )
+        if response.has_redirect_location:
+            raise DeviceError(
+                f"{self.name} sends on to {quote(response.headers['location'])}: if that is the device, write its host "
+                "and port"
+            )
         try:
             root = parse_xml(said)
         except ValueError as error:
@@ -300,6 +314,16 @@ class SoapClient:
         if find(root, "Body") is None:
             raise DeviceError(f"{self.name} answers {message} by no SOAP: check that ONVIF is on, and host and port")
         return root, self._date
+
+    def _send(self, request: "httpx.Request", message: str) -> "httpx.Response":
+        """Send a request; once more where the device has closed a connection that was kept, as some do each time."""
+        httpx = self._httpx
+        try:
+            return self._client.send(request, stream=True)
+        except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
+            if message == "RelativeMove":  # it may have been obeyed
+                raise
+            return self._client.send(request, stream=True)
 
     def _read(self, response: "httpx.Response", message: str, deadline: float) -> bytes:
         """Read an answer, of a limited length and in a limited time."""

@@ -18,6 +18,7 @@ from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.onvif import OnvifDevice, OnvifDome, OnvifLink
 from cotarget.drivers.polled_head import OBEYED_S
 from cotarget.drivers.rig import device_of, devices
+from cotarget.emulators import onvif as emulator
 from cotarget.emulators.onvif import ANSWERS, PAN_TILT, TPTZ, TRT, OnvifCamera, SoapFault
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
@@ -384,6 +385,27 @@ def test_a_status_that_has_been_late_before_may_be_late_again(monkeypatch):
         wait_for(lambda: not late_s)
         time.sleep(2.5)
         assert not dome.head.state().moving
+
+
+def test_a_device_that_answers_commands_by_nothing_but_success_is_driven(monkeypatch):
+    command = re.compile(r"<\w+:(AbsoluteMove|ContinuousMove|Stop)Response>")
+    usual = emulator.envelope
+    monkeypatch.setattr(emulator, "envelope", lambda body: "" if command.match(body) else usual(body))
+    with OnvifUnit() as unit, opened(unit) as dome:
+        dome.head.move(math.radians(20.0), 0.0, wait=True)
+        assert unit.pan.degrees() == pytest.approx(20.0, abs=NEAR_DEG)
+
+
+def test_tokens_may_have_any_characters(monkeypatch):
+    asked = []
+    monkeypatch.setattr(emulator, "_refuse_other_profile", asked.append)
+    profiles = ANSWERS[TRT, "GetProfiles"]
+    monkeypatch.setitem(
+        ANSWERS, (TRT, "GetProfiles"), lambda *about: profiles(*about).replace('"profile_1"', '"main &amp; &lt;1>"')
+    )
+    with OnvifUnit() as unit, opened(unit) as dome:
+        dome.head.move(math.radians(5.0), 0.0, wait=True)
+    assert {message.text("ProfileToken") for message in asked} == {"main & <1>"}
 
 
 # Devices that do not say where they are, or do not go where they are sent

@@ -13,8 +13,9 @@ from xml.etree.ElementTree import fromstring
 import pytest
 
 from cotarget.drivers.link_errors import SilentError
-from cotarget.drivers.onvif import Coordinate, Range, abilities_of, seconds, status_of, vector
+from cotarget.drivers.onvif import Coordinate, Range, abilities_of, path_of, seconds, status_of, vector
 from cotarget.drivers.soap import (
+    EmptyAnswerError,
     LoginFaultError,
     SoapClient,
     device_time,
@@ -93,9 +94,18 @@ def test_a_fault_is_its_reason_and_its_innermost_codes():
 
 @pytest.mark.parametrize(("text", "value"), [
     ("PT5S", 5.0), ("PT1M30.5S", 90.5), ("P1DT1H", 90000.0), ("PT0S", 0.0), ("", 0.0), ("5", 0.0), ("PT-1S", 0.0),
+    ("P0Y0M0DT0H0M10.000S", 10.0),
 ])  # fmt: skip
 def test_durations(text, value):
     assert seconds(text) == value
+
+
+@pytest.mark.parametrize(("address", "path"), [
+    ("http://192.168.1.64:80/onvif/PTZ", "/onvif/PTZ"), ("https://a.lan/ptz.cgi?unit=1&a=2", "/ptz.cgi?unit=1&a=2"),
+    ("http://192.168.1.64", "/onvif/device_service"), ("", "/onvif/device_service"),
+])  # fmt: skip
+def test_of_an_address_of_a_service_path_and_query_count(address, path):
+    assert path_of(address) == path
 
 
 def test_the_devices_time_is_its_utc_time():
@@ -212,6 +222,47 @@ def test_a_command_that_was_given_up_is_discarded_with_its_connection():
         connection, _ = listener.accept()
         with connection, pytest.raises(ConnectionResetError):
             b"".join(iter(lambda: connection.recv(1000), b""))
+
+
+def close_unasked(listener, heard):
+    """Answer one request a connection, and close that only when the next one comes, without an answer."""
+    page = wrapped("<StopResponse/>").encode()
+
+    def read(connection):
+        said = b""
+        while b"</s:Envelope>" not in said and (part := connection.recv(10_000)):
+            said += part
+        heard.append(said)
+
+    with contextlib.suppress(OSError):
+        while True:
+            connection, _ = listener.accept()
+            with connection:
+                read(connection)
+                connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%s" % (len(page), page))
+                read(connection)
+
+
+def test_a_request_that_a_kept_connection_takes_no_more_is_sent_once_more_but_no_relative_move():
+    """As of Thingino's firmware, which closes a connection after each answer and does not say so."""
+    heard = []
+    with listening() as (listener, client):
+        thread = threading.Thread(target=close_unasked, args=(listener, heard))
+        thread.start()
+        client.call("/", "x", "Stop")
+        client.call("/", "x", "AbsoluteMove")
+        assert [b"AbsoluteMove" in each for each in heard] == [False, True, True]
+        with pytest.raises(SilentError, match="broke off at RelativeMove"):
+            client.call("/", "x", "RelativeMove")
+        assert sum(b"RelativeMove" in each for each in heard) == 1
+        listener.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+@pytest.mark.parametrize("status", [200, 204])
+def test_success_without_an_answer_is_told_from_another_protocol(status):
+    with answering(lambda asked: (status, "")) as client, pytest.raises(EmptyAnswerError, match="by nothing"):
+        client.call("/", "x", "AbsoluteMove")
 
 
 def test_a_connection_takes_no_longer_than_the_answer_may():
