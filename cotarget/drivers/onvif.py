@@ -74,6 +74,7 @@ LATEST_S = 0.02  # a status that takes longer is of its end [s]
 TIMEOUT_S = 1.0  # a continuous move ends by itself after this time, where the device can that [s]
 WORKERS = 8  # commands that may be under way at the same time
 FINE = 0.02  # velocities are sent again where they change by more, as a share of the highest
+BEYOND = 0.5  # of a range: one of 360 degrees may be counted from -180 or from 0
 ZOOM_STEPS = 1000  # in which the range of the zoom's number is divided
 OUTSIDE_DEG = 5.0  # this far beyond the device's own range, a position is lost
 ZOOM_SLACK = 0.01  # of that range, by which the reported number may be off
@@ -563,6 +564,7 @@ class OnvifLink(PtzLink):
             status = device.status()
             self._way = self._refuse_unable(status)
             self._coordinates = self._find_coordinates(status)
+            self._refuse_strange(status)
             self.axes = self._find_axes()
             self._refuse_lost(status)
             self._reckoned = [ReckonedAxis(facts, settings.command_delay_s) for facts in self.axes]
@@ -585,13 +587,15 @@ class OnvifLink(PtzLink):
     def poll(self, requests: Requests) -> Sequence[Poll]:
         """Take the newest positions, and reckon those that the device does not say; steer an axis on its way."""
         status, now = self._reader.take(), self._clock.now()
+        if status is not None and self._way != "positions" and (status.pan is None or status.tilt is None):
+            status = None  # without a position nothing is steered
         if status is not None:
             self._refuse_lost(status)
             self._blocks |= now - self._heard > BLIND_S
             self._heard, self._seen = now, status
         elif now - self._heard < BLIND_S:
             return []
-        polls = self._polls(status or Status(None, None, None, now), now)
+        polls = self._polls(status, now)
         try:
             if self._way == "velocities":
                 self._steer(requests, is_blind=status is None)
@@ -691,6 +695,17 @@ class OnvifLink(PtzLink):
             found.append(Coordinate(numbers, numbers if own_degrees else ends))
         return found[0], found[1], Coordinate(ranges[2], ranges[2])
 
+    def _refuse_strange(self, status: Status) -> None:
+        """Refuse positions that are far beyond their ranges: lost ones, or such in other numbers."""
+        for word, number, coordinate in zip(("pan", "tilt", "zoom"), status[:3], self._coordinates, strict=True):
+            lowest, highest = coordinate.numbers
+            beyond = BEYOND * (highest - lowest)
+            if number is not None and not lowest - beyond <= number <= highest + beyond:
+                raise DeviceError(
+                    f"{self._who} says that {word} is at {number:g}, far from its range of {lowest:g} to {highest:g}: "
+                    "switch it off and on, so that it finds its limits; if it says so again, it is not driven"
+                )
+
     def _limits_space(self) -> Space:
         """Return the coordinates of the status of a device without absolute moves: those of its limits."""
         space = find(self._device.configuration, "PanTiltLimits/Range")
@@ -749,12 +764,15 @@ class OnvifLink(PtzLink):
         )
         return pan, tilt, zoom
 
-    def _polls(self, status: Status, now: float) -> list[Poll]:
+    def _polls(self, answer: Status | None, now: float) -> list[Poll]:
         """Make polls of the positions that were said, and of those that are reckoned."""
         polls = []
+        status = answer or Status(None, None, None, now)
         for i, (position, reckoned) in enumerate(zip(self._positions(status), self._reckoned, strict=True)):
             if position is None:
                 self._refuse_silence(i, now)
+                if answer is not None and i in self._said and now > reckoned.arrives:
+                    continue  # it says its position when it stands, which may be later than reckoned
                 here, sigma = reckoned.at(now)
                 polls.append(Poll(i, here, now, sigma=sigma))
             else:

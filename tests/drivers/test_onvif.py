@@ -429,6 +429,26 @@ def test_positions_that_are_not_said_are_reckoned(profile):
         assert dome.zoom.state().focal_px == pytest.approx(dome.zoom.focal_range[1], rel=0.02)
 
 
+@pytest.mark.parametrize("profiles", [(), ("continuous-only",)])
+def test_a_head_that_says_its_position_only_at_rest_has_arrived_when_it_says_so(profiles, monkeypatch):
+    """It turns at half of the speed that rig.toml has."""
+    with OnvifUnit(*profiles) as unit:
+
+        def answer(number, usual, *about):
+            said = usual(*about)
+            return re.sub("<tt:PanTilt x.*?>", '<tt:PanTilt x="nan" y="nan"/>', said) if unit.turning() else said
+
+        counted(monkeypatch, "GetStatus", answer)
+        with opened(unit, speed_deg_s=2 * unit.settings.speed_deg_s, slack_deg=2.0) as dome:
+            with contextlib.suppress(DeviceError):  # steered without positions, it may be late
+                dome.head.move(math.radians(30.0), 0.0, wait=True)
+            assert not unit.turning()
+            state = dome.head.state()
+            assert math.degrees(state.pan) == pytest.approx(unit.pan.degrees(), abs=NEAR_DEG)
+            if not profiles:
+                assert unit.pan.degrees() == pytest.approx(30.0, abs=NEAR_DEG)
+
+
 def test_a_device_without_a_status_is_reckoned_too(monkeypatch):
     def answer(number, usual, *about):
         raise SoapFault("Optional action not implemented", "ActionNotSupported", code="Receiver")
@@ -652,6 +672,19 @@ def test_a_dome_that_cannot_be_driven_is_named_in_one_line(profile, said, monkey
     monkeypatch.setattr(onvif, "ASK_S", 2.0)
     with OnvifUnit(*profile.split(",")) as unit:
         assert re.search(said, refused(unit))
+
+
+def test_a_position_far_from_its_range_is_refused(monkeypatch):
+    """Of an axis that has lost its position, or counts in other numbers."""
+    monkeypatch.setattr(OnvifCamera, "position", lambda camera: (557.4, 0.0, 0.0))
+    with OnvifUnit() as unit:
+        assert "says that pan is at 557.4, far from its range of -1 to 1: switch it off and on" in refused(unit)
+
+
+def test_an_address_of_a_service_that_is_none_is_named(monkeypatch):
+    monkeypatch.setattr(emulator, "_address", lambda *about: "http://[fe80::1/onvif/ptz")
+    with OnvifUnit() as unit:
+        assert "names addresses of services that are none" in refused(unit)
 
 
 @pytest.mark.parametrize(("changes", "said"), [
