@@ -318,12 +318,10 @@ class SoapClient:
     def _send(self, request: "httpx.Request", message: str) -> "httpx.Response":
         """Send a request; once more where the device has closed a connection that was kept, as some do each time."""
         httpx = self._httpx
-        try:
-            return self._client.send(request, stream=True)
-        except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
-            if message == "RelativeMove":  # it may have been obeyed
-                raise
-            return self._client.send(request, stream=True)
+        if message != "RelativeMove":  # which may have been obeyed
+            with contextlib.suppress(httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
+                return self._client.send(request, stream=True)
+        return self._client.send(request, stream=True)
 
     def _read(self, response: "httpx.Response", message: str, deadline: float) -> bytes:
         """Read an answer, of a limited length and in a limited time."""

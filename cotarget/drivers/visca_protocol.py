@@ -538,7 +538,7 @@ def open_line(host: str, port: int, names: Sequence[str], clock: Clock) -> tuple
         tried.append(f"{words}: {found}")
     raise DeviceError(
         f"no camera at {host} answers VISCA ({'; '.join(tried)}): check host and the camera's power, switch VISCA over "
-        "IP on in its network settings, and set port if it has another one there"
+        "IP on in its network settings, set its VISCA address to 1, and set port if it has another one there"
     )
 
 
