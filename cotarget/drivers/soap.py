@@ -205,9 +205,9 @@ class SoapClient:
         Raises:
             LoginFaultError: the user is refused; the message says how far off the device's clock is.
             FaultError: the device answered with a fault.
-            SilentError: there was no whole answer in time.
+            SilentError: the device cannot be reached, or there was no whole answer in time.
             EmptyAnswerError: the answer is empty, and its status success.
-            DeviceError: the device cannot be reached, or the answer is none.
+            DeviceError: the answer is none.
         """
         deadline = time.monotonic() + timeout
         if self._user and self._offset_s is None:
@@ -340,10 +340,10 @@ class SoapClient:
         try:
             yield
         except httpx.ConnectTimeout:
-            raise DeviceError(f"{self.name} does not answer: check host and port, its power and the network") from None
+            raise SilentError(f"{self.name} does not answer: check host and port, its power and the network") from None
         except httpx.ConnectError as error:
             why = _root_of(error)
-            raise DeviceError(
+            raise SilentError(
                 f"{self.name} cannot be reached ({why}): check host and port, its power and the network"
             ) from None
         except httpx.TimeoutException:

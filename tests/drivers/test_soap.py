@@ -259,6 +259,14 @@ def test_a_request_that_a_kept_connection_takes_no_more_is_sent_once_more_but_no
         thread.join()
 
 
+def test_a_device_that_has_gone_is_silent():
+    """So that its unplugging is one error, and the missing answer to the last halt no second one."""
+    with listening() as (listener, client):
+        listener.close()
+        with pytest.raises(SilentError, match="cannot be reached"):
+            client.call("/", "x", "GetStatus")
+
+
 @pytest.mark.parametrize("status", [200, 204])
 def test_success_without_an_answer_is_told_from_another_protocol(status):
     with answering(lambda asked: (status, "")) as client, pytest.raises(EmptyAnswerError, match="by nothing"):
