@@ -57,6 +57,7 @@ SPACES = "http://www.onvif.org/ver10/tptz"
 STEPS_DEG, STEPS = (
     f"{SPACES}/PanTiltSpaces/{name}" for name in ("SphericalTranslationSpaceDegrees", "TranslationGenericSpace")
 )
+GENERIC = f"{SPACES}/PanTiltSpaces/PositionGenericSpace"
 # Ports at which cameras have ONVIF, the usual one first.
 PORTS = (80, 8000, 8080, 8899, 2020)
 ASK_S = 5.0  # for an answer while the device is opened [s]
@@ -677,11 +678,13 @@ class OnvifLink(PtzLink):
     def _find_coordinates(self, status: Status) -> tuple[Coordinate, Coordinate, Coordinate]:
         """Find the coordinate systems of the moves, which have to be those of the status."""
         settings, abilities = self._settings, self._device.abilities
-        turned = abilities.space("AbsolutePanTiltPositionSpace", status.space) or self._limits_space()
+        turned = abilities.space("AbsolutePanTiltPositionSpace", status.space) or self._limits_space(status)
         zoomed = abilities.space("AbsoluteZoomPositionSpace")
         assert zoomed is not None
         ranges = (*(*turned.ranges, NOTHING, NOTHING)[:2], (*zoomed.ranges, NOTHING)[0])
         for word, given in zip(("pan", "tilt", "zoom"), ranges, strict=True):
+            if given == NOTHING:
+                raise DeviceError(f"{self._who} does not say the ends of {word}: it is not driven")
             if not given.lowest < given.highest:
                 raise DeviceError(
                     f"{self._who} says that {word} goes from {given.lowest:g} to {given.highest:g}: it is not driven"
@@ -706,10 +709,15 @@ class OnvifLink(PtzLink):
                     "switch it off and on, so that it finds its limits; if it says so again, it is not driven"
                 )
 
-    def _limits_space(self) -> Space:
-        """Return the coordinates of the status of a device without absolute moves: those of its limits."""
+    def _limits_space(self, status: Status) -> Space:
+        """Return the coordinates of the status of a device without absolute moves: those of its limits.
+
+        Limits are optional; the generic space of the PTZ Service Specification goes from -1 to 1.
+        """
         space = find(self._device.configuration, "PanTiltLimits/Range")
-        return Space("", ()) if space is None else space_of(space)
+        if space is not None:
+            return space_of(space)
+        return Space(GENERIC, (Range(-1.0, 1.0),) * 2) if status.space in ("", GENERIC) else Space(status.space, ())
 
     def _find_axes(self) -> tuple[AxisFacts, AxisFacts, AxisFacts]:
         settings = self._settings

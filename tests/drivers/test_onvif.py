@@ -644,6 +644,25 @@ def test_a_device_that_names_its_spaces_at_the_node_alone_is_sent_to_positions(m
         assert "AbsoluteMove" in unit.moves
 
 
+def test_a_steered_device_that_says_no_limits_has_the_ends_of_the_generic_space(monkeypatch):
+    usual, limits = emulator._configuration, re.compile("<tt:PanTiltLimits>.*</tt:PanTiltLimits>")
+    monkeypatch.setattr(emulator, "_configuration", lambda *about: limits.sub("", usual(*about)))
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        dome.head.move(math.radians(15.0), 0.0, wait=True)
+        assert unit.pan.degrees() == pytest.approx(15.0, abs=unit.settings.slack_deg + NEAR_DEG)
+
+
+def test_ends_that_a_device_does_not_say_are_named(monkeypatch):
+    counted(
+        monkeypatch,
+        "GetConfigurationOptions",
+        lambda number, usual, *about: re.sub("<tt:YRange>.*?</tt:YRange>", "", usual(*about)),
+    )
+    counted(monkeypatch, "GetNodes", lambda *about: "")
+    with OnvifUnit() as unit:
+        assert "does not say the ends of tilt: it is not driven" in refused(unit)
+
+
 # What is wrong from the start
 
 
