@@ -429,24 +429,36 @@ def test_positions_that_are_not_said_are_reckoned(profile):
         assert dome.zoom.state().focal_px == pytest.approx(dome.zoom.focal_range[1], rel=0.02)
 
 
-@pytest.mark.parametrize("profiles", [(), ("continuous-only",)])
-def test_a_head_that_says_its_position_only_at_rest_has_arrived_when_it_says_so(profiles, monkeypatch):
+def nan_on_its_way(unit, monkeypatch):
+    """Let the device say no position of pan and tilt while it turns."""
+
+    def answer(number, usual, *about):
+        said = usual(*about)
+        return re.sub("<tt:PanTilt x.*?>", '<tt:PanTilt x="nan" y="nan"/>', said) if unit.turning() else said
+
+    counted(monkeypatch, "GetStatus", answer)
+
+
+def test_a_head_that_says_its_position_only_at_rest_has_arrived_when_it_says_so(monkeypatch):
     """It turns at half of the speed that rig.toml has."""
-    with OnvifUnit(*profiles) as unit:
-
-        def answer(number, usual, *about):
-            said = usual(*about)
-            return re.sub("<tt:PanTilt x.*?>", '<tt:PanTilt x="nan" y="nan"/>', said) if unit.turning() else said
-
-        counted(monkeypatch, "GetStatus", answer)
-        with opened(unit, speed_deg_s=2 * unit.settings.speed_deg_s, slack_deg=2.0) as dome:
-            with contextlib.suppress(DeviceError):  # steered without positions, it may be late
-                dome.head.move(math.radians(30.0), 0.0, wait=True)
+    with OnvifUnit() as unit:
+        nan_on_its_way(unit, monkeypatch)
+        with opened(unit, speed_deg_s=2 * unit.settings.speed_deg_s) as dome:
+            dome.head.move(math.radians(30.0), 0.0, wait=True)
             assert not unit.turning()
-            state = dome.head.state()
-            assert math.degrees(state.pan) == pytest.approx(unit.pan.degrees(), abs=NEAR_DEG)
-            if not profiles:
-                assert unit.pan.degrees() == pytest.approx(30.0, abs=NEAR_DEG)
+            assert math.degrees(dome.head.state().pan) == pytest.approx(30.0, abs=NEAR_DEG)
+            assert unit.pan.degrees() == pytest.approx(30.0, abs=NEAR_DEG)
+
+
+def test_a_steered_head_that_says_its_position_only_at_rest_goes_by_and_by_and_can_be_halted(monkeypatch):
+    with OnvifUnit("continuous-only") as unit:
+        nan_on_its_way(unit, monkeypatch)
+        with opened(unit) as dome:
+            dome.head.move(math.radians(60.0), 0.0, speed=math.radians(20.0))
+            wait_for(lambda: unit.pan.degrees() > 5.0)
+            assert dome.head.state().moving
+            dome.head.halt()
+            wait_for(lambda: not unit.turning())
 
 
 def test_a_device_without_a_status_is_reckoned_too(monkeypatch):
