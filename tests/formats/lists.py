@@ -20,7 +20,7 @@ SAME = 1e-6  # what is computed from the same numbers on another processor [rela
 # Corners in the same pictures, found by another version of OpenCV, and what a fit to them differs by.
 CORNERS_PX, CAPTURES_M, CAPTURES_DEG, CAPTURES_FOCAL = 0.02, 1e-3, 0.02, 1e-3
 # Of a replay of 0.1.0, whose filter had more numbers: half a step of the head [degrees]; lens [px]; columns [relative].
-COMMANDS_DEG, COMMANDS_PX, COMMANDS = 0.0257, 0.1, 2e-3
+COMMANDS_DEG, COMMANDS_PX, COMMANDS = 0.044, 0.1, 2e-3
 VIEWS = 2  # images in which another version of OpenCV finds the board, or does not
 DETECTED_PX = 1.0  # what another version of OpenCV or of the film's decoder changes of a track
 PRINTED = 0.002  # pixels of a board at its edges, as another version of matplotlib draws them
