@@ -121,11 +121,13 @@ class HeadLink(Protocol):
         name: of the port, for messages.
         axes: facts of pan, of tilt, and of the lens where the unit moves it too, as reported when it was opened.
         pause_s: pause between polls [s]; 0 where the exchange itself takes the time, as on a serial line.
+        answer_s: time that the unit may take for an answer, where that is long [s].
     """
 
     name: str
     axes: tuple[AxisFacts, ...]
     pause_s: float = 0.0
+    answer_s: float = 0.0
 
     def poll(self, requests: Requests) -> Sequence[Poll]:
         """Ask for the position of one axis, in turn, or of several.

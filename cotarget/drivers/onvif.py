@@ -14,6 +14,7 @@ import contextlib
 import math
 import queue
 import re
+import statistics
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
@@ -61,16 +62,20 @@ GENERIC = f"{SPACES}/PanTiltSpaces/PositionGenericSpace"
 # Ports at which cameras have ONVIF, the usual one first.
 PORTS = (80, 8000, 8080, 8899, 2020)
 ASK_S = 5.0  # for an answer while the device is opened [s]
-COMMAND_S = 1.5  # for the answer to a command [s]
+COMMAND_S = 1.5  # for the answer to a command, beyond what is usual for the device [s]
+SLOWEST_S = 1.5  # usual for an answer: a device that takes longer cannot be stopped in time [s]
 STATUS_S = 35.0  # for a status: some devices answer when a move has ended [s]
-STOP_S = 0.5  # for the answer to a stop, which is then repeated [s]
+STOP_S = 0.5  # for the answer to a stop, which is then repeated, beyond what is usual for the device [s]
+STEERED_S = 0.5  # the same for one that is steered by velocities, which would swing about its goal [s]
+REMEDY = "close its page and other programs that ask it, and check the network"
+SLOW_S = 0.1  # an answer that usually takes longer is named [s]
 LOOK_S = 0.01  # period of looking for a halt during a command [s]
 STATUS_PAUSE_S = 0.03  # between the answer to a status and the next question [s]
 STATUS_TRIES = 3  # failed statuses in a row, after which the device has gone
 RETRY_S = 0.2  # pause after a failed status [s]
 RIGHTS = "moving takes the rights of an operator or administrator"
 STILL_S = 0.3  # whether a device says that it moves cannot be believed; it stands after this time in one place [s]
-BLIND_S = 0.5  # positions are reckoned where the device has said none for this time [s]
+BLIND_S = 0.5  # positions are reckoned where the device has said none for this time, beyond what is usual for it [s]
 LATEST_S = 0.02  # a status that takes longer is of its end [s]
 TIMEOUT_S = 1.0  # a continuous move ends by itself after this time, where the device can that [s]
 WORKERS = 8  # commands that may be under way at the same time
@@ -289,16 +294,18 @@ class OnvifDevice:
         url: address of its stream.
         configuration: the PTZ configuration of its profile.
         abilities: how it can be moved.
+        answer_s: median time that it took for an answer while it was opened [s].
 
     Raises:
         ConfigError: it has no such profile.
-        DeviceError: there is no such device, it refuses the user, or it cannot be moved.
+        DeviceError: there is no such device, it refuses the user, it answers too slowly, or it cannot be moved.
     """
 
     def __init__(self, settings: OnvifSettings, clock: Clock) -> None:
         self._settings, self._clock = settings, clock
         password = settings.password or environ.get(settings.password_env, "")
         self._remedy = f"check hardware.ptz.user and the password, which may be in {settings.password_env}"
+        self._took_s = list[float]()
         self.soap = self._connect(settings, password)
         with contextlib.ExitStack() as opened:
             opened.callback(self.soap.close)
@@ -307,18 +314,20 @@ class OnvifDevice:
             names = (text_at(said, name) for name in ("Manufacturer", "Model", "FirmwareVersion"))
             self.model = quote(" ".join(filter(None, names))) or "a device"
             media, self._ptz = self._services()
+            self._refuse_slow()
             self.profile, self.configuration = self._find_profile(media)
             token = f"<ConfigurationToken>{escape(self.configuration.get('token', ''))}</ConfigurationToken>"
             found = abilities_of(self._ask_if_able(self._ptz, PTZ, "GetConfigurationOptions", token))
             self.abilities = replace(found, spaces=self._node_spaces() | dict(found.spaces))
             self.url = settings.url or self._stream_address(media)
+            self.answer_s = statistics.median(self._took_s)
             opened.pop_all()
 
     def status(self) -> Status:
         """Ask for the positions."""
         begin = self._clock.now()
         try:
-            root = self._ask(self._ptz, PTZ, "GetStatus", self._token, STATUS_S)
+            root = self.soap.call(self._ptz, PTZ, "GetStatus", self._token, STATUS_S)
         except LoginFaultError:
             raise
         except FaultError:  # some have no status
@@ -326,10 +335,10 @@ class OnvifDevice:
         now = self._clock.now()
         return status_of(root, now - min((now - begin) / 2, LATEST_S) - self._settings.status_delay_s)
 
-    def command(self, message: str, inner: str, timeout: float = COMMAND_S) -> None:
+    def command(self, message: str, inner: str, timeout: float) -> None:
         """Send a command; raises as `SoapClient.call` does. Some devices answer with success alone."""
         with contextlib.suppress(EmptyAnswerError):
-            self._ask(self._ptz, PTZ, message, self._token + inner, timeout)
+            self.soap.call(self._ptz, PTZ, message, self._token + inner, timeout)
 
     def order(self, message: str, inner: str) -> StopOrder:
         """Write a command for a `Guardian`."""
@@ -341,8 +350,21 @@ class OnvifDevice:
     def _token(self) -> str:
         return f"<ProfileToken>{escape(self.profile)}</ProfileToken>"
 
-    def _ask(self, path: str, namespace: str, message: str, inner: str = "", timeout: float = ASK_S) -> Element:
-        return self.soap.call(path, namespace, message, inner, timeout)
+    def _ask(self, path: str, namespace: str, message: str, inner: str = "") -> Element:
+        """Ask while the device is opened; remember how long its answer took."""
+        begin = self._clock.now()
+        try:
+            return self.soap.call(path, namespace, message, inner, ASK_S)
+        finally:
+            self._took_s.append(self._clock.now() - begin)
+
+    def _refuse_slow(self) -> None:
+        """Refuse a device by the shortest time of its first answers, since one alone may be late."""
+        if (took_s := min(self._took_s)) > SLOWEST_S:
+            raise DeviceError(
+                f"{self.name} ({self.model}) takes {took_s:.1f} s for an answer, too long for a head to be stopped: "
+                f"{SLOWEST_S:g} s is the most; {REMEDY}"
+            )
 
     def _ask_if_able(self, path: str, namespace: str, message: str, inner: str = "") -> Element | None:
         """Ask what some devices cannot answer; None for a fault that is not about the user."""
@@ -580,6 +602,7 @@ class OnvifLink(PtzLink):
             self.identity = self._describe(status)
             self._goals: tuple[float | None, float | None, float | None] = self._positions(status)
             self._workers = Workers()
+            self.answer_s = 2 * device.answer_s  # one answer takes longer than another
             self._sent = Future[None]()  # of the newest command
             self._sent.set_result(None)
             self._reader = StatusReader(device.status, status)
@@ -592,9 +615,9 @@ class OnvifLink(PtzLink):
             status = None  # without a position nothing is steered
         if status is not None:
             self._refuse_lost(status)
-            self._blocks |= now - self._heard > BLIND_S
+            self._blocks |= now - self._heard > BLIND_S + self.answer_s
             self._heard, self._seen = now, status
-        elif now - self._heard < BLIND_S:
+        elif now - self._heard < BLIND_S + self.answer_s:
             return []
         polls = self._polls(status, now)
         try:
@@ -603,7 +626,7 @@ class OnvifLink(PtzLink):
             elif self._way == "steps" and status is not None and status.t > self._due + STILL_S:
                 self._step_on(requests)
         except RefusedError as error:  # such as "busy": it ends the move
-            self._stop(now + STOP_S)
+            self._stop(now + STOP_S + self.answer_s)
             raise CutError(str(error)) from None
         return polls
 
@@ -634,7 +657,7 @@ class OnvifLink(PtzLink):
 
     def halt(self, patience: float) -> None:
         """Stop pan and tilt; once more when a command that was given up is answered, since it may move them later."""
-        deadline = self._clock.now() + max(patience, STOP_S)
+        deadline = self._clock.now() + max(patience, STOP_S) + self.answer_s
         self._goals = (None, None, self._goals[2])
         self._stop(deadline)
         if not self._sent.done():
@@ -658,6 +681,11 @@ class OnvifLink(PtzLink):
         if abilities.space("AbsolutePanTiltPositionSpace") and self._settings.absolute:
             return "positions"
         by = "velocities" if abilities.space("ContinuousPanTiltVelocitySpace") else "steps"
+        if by == "velocities" and self._device.answer_s > STEERED_S:
+            raise DeviceError(
+                f"{who} takes {self._device.answer_s:.1f} s for an answer, too long to be steered by velocities: "
+                f"{STEERED_S:g} s is the most; {REMEDY}"
+            )
         if by == "steps" and self._steps_space() is None:
             by = "steps in parts of its picture" if abilities.space("RelativePanTiltTranslationSpace") else "presets"
             raise DeviceError(f"{who} has neither absolute moves nor velocities, only {by}: it is not driven")
@@ -759,9 +787,17 @@ class OnvifLink(PtzLink):
             where.append(f"no position of {' and '.join(missing)}, which is reckoned from the commands")
         off = self._device.soap.clock_off_s
         clock = [f"its clock {off:+.0f} s off"] if abs(off) > 1.0 else []
+        slow = [f"answers after {self._device.answer_s:.1f} s"] if self._device.answer_s > SLOW_S else []
         way = {"velocities": ["steered by velocities"], "steps": ["moved by relative moves"]}.get(self._way, [])
         address = self.name.removeprefix("the device at ")
-        parts = [f"{self._device.model} at {address}", f"profile {quote(self._device.profile)}", *clock, *way, *where]
+        parts = [
+            f"{self._device.model} at {address}",
+            f"profile {quote(self._device.profile)}",
+            *clock,
+            *slow,
+            *way,
+            *where,
+        ]
         return ", ".join(parts)
 
     def _positions(self, status: Status) -> tuple[float | None, float | None, float | None]:
@@ -872,11 +908,11 @@ class OnvifLink(PtzLink):
 
     def _stop(self, deadline: float) -> None:
         """Stop; repeat each order until it is answered."""
-        orders = self._stops
+        orders, limit_s = self._stops, STOP_S + self.answer_s
         faults, count = list[BaseException](), len(orders)
         while orders:
-            answers = [self._workers.submit(partial(self._device.command, *order, STOP_S)) for order in orders]
-            wait(answers, STOP_S + LOOK_S)
+            answers = [self._workers.submit(partial(self._device.command, *order, limit_s)) for order in orders]
+            wait(answers, limit_s + LOOK_S)
             errors = [answer.exception() if answer.done() else NotDoneError("no whole answer") for answer in answers]
             faults += [error for error in errors if isinstance(error, FaultError)]
             silent = [error for error in errors if error is not None and not isinstance(error, FaultError)]
@@ -946,7 +982,7 @@ class OnvifLink(PtzLink):
 
     def _send(self, message: str, inner: str, requests: Requests) -> None:
         """Send a command; give up waiting for its answer where a halt waits."""
-        self._sent = self._workers.submit(partial(self._device.command, message, inner))
+        self._sent = self._workers.submit(partial(self._device.command, message, inner, COMMAND_S + self.answer_s))
         while True:
             try:
                 self._sent.result(timeout=LOOK_S)

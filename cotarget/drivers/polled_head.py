@@ -589,7 +589,9 @@ class PolledHead:
             return
         request = Halt(next(self._numbers))
         self._loop.requests.add(self._loop.requests.halts, request)
-        request.done.wait(HALT_S + braking_s(self.axes) if self._thread.is_alive() else 0.0)
+        # The halt may come after the answer to a command that was given up.
+        limit_s = HALT_S + braking_s(self.axes) + 2 * self._link.answer_s
+        request.done.wait(limit_s if self._thread.is_alive() else 0.0)
         if request.answered or self._loop.rests:
             return
         if not self._thread.is_alive() and not isinstance(self._dead, LostError):

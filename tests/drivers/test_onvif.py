@@ -29,6 +29,7 @@ SAFETY = SafetyConfig(stop_file=None)
 NEAR_DEG = 2 * STEP_DEG
 LOST_S = 0.7  # longer than a stop waits for its answer
 AWAY_S = 0.25
+STOPS_S = 0.3  # in which a head is at rest, beyond the latency of its device
 SILENT_S = 60.0
 HANGS_AT, HANGS_S = 10, 2.0  # the status of this number takes so long
 NOTICED_S = 1.0  # another client's move
@@ -313,6 +314,27 @@ def test_a_move_without_an_answer_delays_no_halt_and_cannot_outlive_it():
         time.sleep(1.0)
         assert not unit.turning()
         assert unit.pan.degrees() < 60.0
+
+
+def test_a_device_that_takes_its_time_for_each_answer_is_driven_and_stopped(monkeypatch):
+    monkeypatch.setattr(emulator, "SLOW_S", LOST_S)
+    with OnvifUnit("slow-answers", login=False) as unit, opened(unit) as dome:
+        dome.head.move(math.radians(20.0), math.radians(10.0), wait=True)
+        assert (unit.pan.degrees(), unit.tilt.degrees()) == pytest.approx((20.0, 10.0), abs=NEAR_DEG)
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(20.0))
+        wait_for(lambda: unit.pan.degrees() > 23.0)
+        begin = unit.pan.degrees()
+        dome.head.halt()
+        wait_for(lambda: not unit.turning())
+        assert unit.pan.degrees() - begin < 20.0 * (LOST_S + STOPS_S)
+
+
+@pytest.mark.parametrize(("profile", "slow_s"), [((), 1.7), (("continuous-only",), 0.6)])
+def test_a_device_that_answers_too_late_to_be_moved_is_refused(profile, slow_s, monkeypatch):
+    monkeypatch.setattr(emulator, "SLOW_S", slow_s)
+    with OnvifUnit("slow-answers", *profile, login=False) as unit:
+        assert "s for an answer" in refused(unit)
+        assert unit.moves == []
 
 
 def test_a_device_that_goes_away_is_an_error_of_one_line():
