@@ -341,10 +341,11 @@ class OnvifDevice:
             self.soap.call(self._ptz, PTZ, message, self._token + inner, timeout)
 
     def order(self, message: str, inner: str) -> StopOrder:
-        """Write a command for a `Guardian`."""
+        """Write a command for a `Guardian`; the login goes with it only where the device asks for HTTP digest."""
         host, _, port = self._address.rpartition(":")
         signed = self.soap.signed(self._ptz, PTZ, message, self._token + inner)
-        return False, host.strip("[]"), int(port), [signed.decode("latin-1")]
+        login = self.soap.login if b"\nauthorization: " in signed else ()
+        return StopOrder(False, host.strip("[]"), int(port), [signed.decode("latin-1")], login)
 
     @property
     def _token(self) -> str:

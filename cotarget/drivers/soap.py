@@ -183,6 +183,11 @@ class SoapClient:
         self._offset_s: float | None = None  # of the device's clock
         self._date: datetime | None = None  # in the header of the newest answer
 
+    @property
+    def login(self) -> tuple[str, ...]:
+        """User and password; empty without a user."""
+        return (self._user, self._password) if self._user else ()
+
     def close(self) -> None:
         """Release the connections."""
         self._client.close()

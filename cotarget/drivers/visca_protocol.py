@@ -356,7 +356,7 @@ class Line:
         if self.transport.header:
             messages = [pack(CONTROL, 0, RESET), pack(COMMAND, FIRST, STOP)]
         is_udp = self.transport.kind == socket.SOCK_DGRAM
-        return is_udp, host, port, [message.decode("latin-1") for message in messages]
+        return StopOrder(is_udp, host, port, [message.decode("latin-1") for message in messages])
 
     def cancel(self, places: Sequence[int]) -> None:
         """Cancel the commands in the camera's sockets; waits for no answer."""

@@ -1,18 +1,23 @@
 """A device is stopped when the program that moves it is killed: programs in real time, and SIGKILL."""
 
+import dataclasses
 import os
 import pickle
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
+from urllib.request import parse_http_list, parse_keqv_list
 
+import httpx
 import pytest
 
-from cotarget.drivers.guardian import Guardian
+from cotarget.drivers.guardian import Guardian, sign
 from cotarget.drivers.onvif import OnvifLink
 from cotarget.drivers.visca import ViscaLink
+from cotarget.emulators.authentication import Authenticator
 from tests.support.onvif_dome import OnvifUnit
 from tests.support.plants import LiveDome, wait_for
 
@@ -71,6 +76,55 @@ def test_an_onvif_dome_that_is_steered_is_stopped(also):
         turned_s = kill_while_it_turns(unit, OnvifLink, unit.settings, (150.0, 60.0), (10.0, 5.0))
         assert turned_s < STOPS_S + BRAKES_S
         assert unit.pan.degrees() < 100.0
+
+
+def test_a_steered_onvif_dome_that_takes_each_nonce_once_is_stopped(monkeypatch):
+    """What was signed while it turned is refused."""
+    allows, challenge, valid = Authenticator.allows, Authenticator.challenge.fget, set()
+
+    def challenge_anew(guard):
+        valid.add(nonce := os.urandom(8).hex())
+        return challenge(dataclasses.replace(guard, nonce=nonce))
+
+    def allow_once(guard, method, target, headers):
+        used = valid.intersection(re.findall(r'\bnonce="(.*?)"', headers.get("Authorization", "")))
+        valid.difference_update(used)
+        return bool(used) and allows(dataclasses.replace(guard, nonce=used.pop()), method, target, headers)
+
+    monkeypatch.setattr(Authenticator, "challenge", property(challenge_anew))
+    monkeypatch.setattr(Authenticator, "allows", allow_once)
+    with OnvifUnit("continuous-only", "timeout-ignored", "http-digest") as unit:
+        turned_s = kill_while_it_turns(unit, OnvifLink, unit.settings, (150.0, 60.0), (10.0, 5.0))
+        assert turned_s < STOPS_S + BRAKES_S
+        assert unit.pan.degrees() < 100.0
+
+
+REFUSAL = 'HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: Basic realm="x"\r\nWWW-Authenticate: Digest {}\r\n\r\n'
+REQUEST = "POST /onvif/ptz HTTP/1.1\r\nHost: dome\r\nAuthorization: Digest old\r\n\r\nstop"
+
+
+@pytest.mark.parametrize("more", [', qop="auth,auth-int", algorithm=SHA-256, opaque="a, b"', ""])
+def test_a_refused_stop_is_signed_as_an_http_client_signs_it(more):
+    """httpx finds the same response for the same nonces."""
+    challenge = f'realm="IP Camera (1), x", nonce="0a1b", stale=FALSE{more}'
+    signed = sign(REQUEST, REFUSAL.format(challenge), ("jürgen ж", "geheim ß"))
+    assert signed.endswith("\r\n\r\nstop")
+    assert "old" not in signed
+    said = signed.partition("Authorization: ")[2].partition("\r\n")[0]
+    client = httpx.DigestAuth("jürgen ж", "geheim ß")
+    client._get_client_nonce = lambda *_: "".join(re.findall('cnonce="(.*?)"', said)).encode()
+    steps = client.sync_auth_flow(httpx.Request("POST", "http://dome/onvif/ptz"))
+    asked = next(steps)
+    expected = steps.send(httpx.Response(401, headers={"WWW-Authenticate": f"Digest {challenge}"}, request=asked))
+    sent = [said.encode("latin-1").decode(), expected.headers.raw[-1][1].decode()]
+    fields = [parse_keqv_list(parse_http_list(each.removeprefix("Digest "))) for each in sent]
+    assert fields[0].pop("algorithm", "MD5") == fields[1].pop("algorithm")
+    assert fields[0] == fields[1]
+
+
+@pytest.mark.parametrize("answer", ["HTTP/1.1 200 OK\r\n\r\n", "HTTP/1.1 401 No\r\n\r\n", ""])
+def test_what_asks_for_no_digest_is_not_signed(answer):
+    assert sign(REQUEST, answer, ("admin", "secret")) is None
 
 
 @pytest.fixture
