@@ -1,15 +1,11 @@
 """An emulated ONVIF dome with axes, a lens and pictures of its own behind it."""
 
 import contextlib
-import dataclasses
-import itertools
 import time
 from types import SimpleNamespace
 
-from cotarget.config import SafetyConfig
-from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.onvif import OnvifDome, OnvifSettings
-from cotarget.emulators.onvif import ANSWERS, ONVIF_FAULTS, ONVIF_PROFILES, TPTZ, OnvifCamera, OnvifModel, OnvifServer
+from cotarget.drivers.onvif import OnvifSettings
+from cotarget.emulators.onvif import ONVIF_FAULTS, ONVIF_PROFILES, OnvifCamera, OnvifModel, OnvifServer
 from cotarget.emulators.rtsp import RTSP_FAULTS, EncodedStream, Encoder, RtspServer
 from cotarget.emulators.serve import Faults
 from cotarget.emulators.world import EmulatedAxis
@@ -17,7 +13,6 @@ from cotarget.sim.motion import Axis
 from tests.support.emulated_camera import Film, LensModel, plain
 from tests.support.plants import FEED_SIZE, PASSWORD, USER
 
-SAFETY = SafetyConfig(stop_file=None)
 RATE_HZ, STEP_DEG = 25.0, 0.01
 GROUP_S = 0.2  # a client that joins waits for a key frame
 PAN_DEG, TILT_DEG, SPEED_DEG_S = (-150.0, 170.0), (-30.0, 90.0), 100.0
@@ -95,17 +90,3 @@ class OnvifUnit:
 
     def turning(self):
         return self.pan.moving() or self.tilt.moving()
-
-
-@contextlib.contextmanager
-def opened(unit, **changes):
-    """Open the driver of a unit, with changed settings."""
-    settings = dataclasses.replace(unit.settings, **changes)
-    with contextlib.closing(OnvifDome(settings, MonotonicClock(), SAFETY)) as dome:
-        yield dome
-
-
-def counted(monkeypatch, name, answer):
-    """Let a function answer a message of the PTZ service; it is called with the number of messages so far, too."""
-    usual, number = ANSWERS[TPTZ, name], itertools.count()
-    monkeypatch.setitem(ANSWERS, (TPTZ, name), lambda *about: answer(next(number), usual, *about))
