@@ -169,13 +169,8 @@ class ZoomController:
         wanted = min(max(wanted_px, self._range[0]), fast_px)
         sure = longest_focal(seen, settings.sure, size, self._range, settings.rim_px)
         goal = min(wanted, sure)
-        reason = (
-            "unsure"
-            if wanted > sure
-            else "head too slow"
-            if wanted == fast_px < min(wanted_px, self._range[1])
-            else "wanted"
-        )
+        slow = wanted < min(wanted_px, self._range[1])
+        reason = "unsure" if wanted > sure else "head too slow" if slow else "wanted"
         change = math.log(goal / commanded_px)
         if change > settings.deadband:
             if t - self._out_t < settings.settle_s:

@@ -31,9 +31,9 @@ from cotarget.emulators.world import paced
 from cotarget.files import write_atomically
 from cotarget.sim.world import SimWorld
 from experiments.engine import Row
+from experiments.wire.follow import PASSWORD, USER
 from experiments.wire.rig import load, talking
 
-USER, PASSWORD = "operator", "secret"
 FIXED_HZ = 5.0  # of the fixed camera, of which the command takes one picture; the watchdog wants three in a second
 LONGEST_S = 600.0  # a command that takes longer is given up [s]
 MOST_TIMES = 2  # that the command is run
