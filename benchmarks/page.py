@@ -570,6 +570,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 SETTINGS = PageSettings()
-QUICK = replace(SETTINGS, seconds=5.0, block_s=2.0, opened=2, orders=5, rendered=False)
+QUICK = replace(SETTINGS, seconds=2.0, block_s=0.5, opened=1, orders=2, rendered=False)
 ALONE = True
 COST_S = 240.0

@@ -10,12 +10,17 @@ import pytest
 # Tests run side by side: threads of their own in each would only get into each other's way.
 for _threads in ("OPENBLAS_NUM_THREADS", "LP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):  # algebra, rendering, images
     os.environ.setdefault(_threads, "1")
-# Tests of the wire wait in real time more than they work, so that two cores have room for four processes.
-FEWEST = 4
+# Tests of the wire wait in real time more than they work, so that two cores have room for five processes.
+FEWEST = 5
+LONGEST = "test_onvif.py"  # a minute or more than any other; what begins last must not be this
 
 
 def pytest_xdist_auto_num_workers(config):
     return max(FEWEST, os.cpu_count() or FEWEST)
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.path.name != LONGEST)
 
 
 @pytest.fixture(autouse=True, scope="session")
