@@ -69,6 +69,24 @@ def test_a_missing_package_is_named_with_its_command(tried, monkeypatch, capsys)
     assert f"MISSING  pyserial: not installed\n         fix: {pip_install('pyserial')}\n" in out
 
 
+def test_the_rig_of_the_folder_is_examined(tried, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text("[targets.bird]\nsize = 80\n")
+    assert cli.main(["doctor"]) == 1
+    assert "MISSING  targets.bird.size: 80 m is far from the 0.8 m" in capsys.readouterr().out
+    (tmp_path / "rig.toml").write_text("[targets.bird]\nsise = 0.8\n")
+    assert cli.main(["doctor"]) == 1
+    assert capsys.readouterr().err.startswith("cotarget doctor: rig.toml: unknown key 'targets.bird.sise'")
+
+
+def test_a_package_that_reads_rig_toml_may_be_missing(tried, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").touch()
+    monkeypatch.setitem(sys.modules, "cotarget.backends", None)
+    assert cli.main(["doctor"]) == 0
+    assert "ok       numpy" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("module", ["av", "serial.tools"])
 def test_broken_package_does_not_stop_the_doctor(tried, monkeypatch, module):
     monkeypatch.setitem(sys.modules, module, None)
