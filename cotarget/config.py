@@ -727,9 +727,12 @@ def config_of(text: str, path: Path) -> RigConfig:
         path: path of the file; relative paths are relative to its folder, and messages name it. It is not read.
 
     Raises:
-        ConfigError: the text is malformed, or has an unknown key or an impossible value.
+        ConfigError: the text is malformed, has an unknown key or an impossible value, or names devices without saying
+            that they are to be opened.
     """
     table = _tables(text, path)
+    if "hardware" in table and "backend" not in table:  # the simulation would answer in place of the devices
+        raise ConfigError(f'{path}: backend: is missing; devices are opened by backend = "hardware" above all tables')
     try:
         config = parse_config(table, path.parent)
     except ConfigError as error:

@@ -132,10 +132,9 @@ def read_object(path: Path, wanted: str) -> Table:
         table = json.loads(text, parse_constant=refuse)
     except FileNotFoundError:
         raise CalibrationError(f"{path}: no such file; {wanted}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise CalibrationError(f"{path}: cannot be read: {reason}") from None
-    except (json.JSONDecodeError, RecursionError) as error:
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise CalibrationError(f"{path}: is not JSON: {error}; {wanted}") from None
     if not isinstance(table, dict):
         raise CalibrationError(f"{path}: holds no JSON object; {wanted}")

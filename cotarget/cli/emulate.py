@@ -32,10 +32,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
     about = "emulate head and zoom camera as one dome that is moved by this protocol (a PTU-D46 and a PowerShot)"
     parser.add_argument("--ptz", choices=("onvif", "visca"), help=about)
-    about = "how the dome deviates from its standard: faults of ptz, listed below, without ptz."
+    about = "how the dome deviates from its standard: faults of ptz, listed below, without ptz"
     parser.add_argument("--profile", type=lambda text: text.split(","), default=[], metavar="NAME[,NAME]", help=about)
     about = "units of a VISCA dome (ptzoptics)"
-    parser.add_argument("--units", choices=("ptzoptics", "evi_d70", "evi_d80"), default="ptzoptics", help=about)
+    parser.add_argument("--units", choices=("ptzoptics", "evi_d70", "evi_d80"), help=about)
     about = "connect the head by TCP instead of a serial port, or a VISCA dome instead of by UDP"
     parser.add_argument("--tcp", action="store_true", help=about)
     parser.add_argument("--user", default="", metavar="NAME", help="user name that cameras and dome ask for (none)")
@@ -64,6 +64,16 @@ def epilog() -> str:
     return "\n".join([*lines, f"faults of the picture of a dome: {listed({'picture': FIXED['rtsp']})}"])
 
 
+def check_dome(options: argparse.Namespace) -> None:
+    """Refuse what the dome of --ptz does not have."""
+    if options.profile and not options.ptz:
+        raise ConfigError("--profile: is of a dome; give --ptz onvif")
+    if options.units and options.ptz != "visca":
+        raise ConfigError("--units: is of a VISCA dome; give --ptz visca")
+    if options.tcp and options.ptz == "onvif":
+        raise ConfigError("--tcp: is of a PTU-D46 or a VISCA dome; ONVIF is over TCP without it")
+
+
 def run(options: argparse.Namespace) -> None:
     """Serve a simulated rig by the devices' wire protocols, and write a rig.toml for it."""
     os.environ.setdefault(*RENDER_THREADS)
@@ -82,8 +92,7 @@ def run(options: argparse.Namespace) -> None:
         beside = copied_tables(read_tables(options.rig), options.rig.parent)
     check_outputs([options.write], rig_files(options.rig, config))
     protocol, fixed_port = options.fixed or ("axis", 0)
-    if options.profile and not options.ptz:
-        raise ConfigError("--profile: is of a dome; give --ptz onvif")
+    check_dome(options)
     faults = {
         fault: option
         for option, names in (("--fault", options.fault), ("--profile", [f"ptz.{name}" for name in options.profile]))
@@ -96,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
     password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
     if options.user and not password:
         raise ConfigError("--user needs a password: put it into the environment variable COTARGET_PASSWORD")
-    how = {"fixed": protocol, "dome": options.ptz or "", "units": options.units}
+    how = {"fixed": protocol, "dome": options.ptz or "", "units": options.units or "ptzoptics"}
     with Emulation(paced(config), ports, user=options.user, password=password, **how) as emulation:
         for fault in faults:
             emulation.switch(fault)

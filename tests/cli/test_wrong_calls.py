@@ -42,6 +42,7 @@ FILES = {
     "unstoppable.toml": "[safety]\nstop_file = 5\n",
     "nameless.toml": 'backend = "hardware"\n[board]\nsquare = 0.1\n',
     "hw.toml": HARDWARE,
+    "no_backend.toml": HARDWARE.replace('backend = "hardware"', ""),
     "replay.toml": 'backend = "replay"\nrecording = "none"\n',
     "of_nothing.toml": 'backend = "replay"\n',
     "broken.json": '{"schema": 2, "fixed": {',
@@ -136,6 +137,7 @@ CALLS = [
     # what operates a rig; refused before any device is opened
     ("point --rig nameless.toml", FAILED, "nameless.toml: hardware.head.port"),
     ("point --rig replay.toml", FAILED, "replay.toml: backend"),
+    ("where --rig no_backend.toml", FAILED, "no_backend.toml: backend: ", 'backend = "hardware"'),
     ("point --rig rig.toml --pictures film.mp4", FAILED, "film.mp4"),
     ("latency --rig replay.toml", FAILED, "replay.toml: backend"),
     ("latency --rig nameless.toml", FAILED, "hardware.head.port", "/dev/tty"),
@@ -148,6 +150,8 @@ CALLS = [
     ("emulate --rig hw.toml --write new.toml", FAILED, "hw.toml: backend"),
     ("emulate --write new.toml --user root", FAILED, "--user", "COTARGET_PASSWORD"),
     ("emulate --write new.toml --fault silence", FAILED, "--fault", "'silence'", "fixed., head., zoom."),
+    ("emulate --write new.toml --units evi_d70", FAILED, "--units", "--ptz visca"),
+    ("emulate --write new.toml --ptz onvif --tcp", FAILED, "--tcp", "VISCA"),
     ("emulate --write new.toml --head 65536", USAGE, "--head", "'65536'"),
     # what shows and inspects
     ("view --port 5", FAILED, "--port", "--browser"),
