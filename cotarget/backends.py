@@ -21,16 +21,20 @@ def load_config(path: Path | str, text: str | None = None) -> "RigConfig":
         text: text of the file; by default it is read.
 
     Raises:
-        ConfigError: the file is missing or malformed, or has an unknown key or an impossible value.
+        ConfigError: the file is missing or malformed, has an unknown key or an impossible value, or names devices and
+            no backend.
     """
-    from cotarget.config import config_of, read_text
+    from cotarget.config import config_of, read_text, tables_of
 
     path = Path(path)
-    config = config_of(read_text(path) if text is None else text, path)
+    text = read_text(path) if text is None else text
+    config = config_of(text, path)
     try:
         check(config)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+    if any(vars(config.hardware).values()) and "backend" not in tables_of(text, path):  # a simulation would answer
+        raise ConfigError(f'{path}: backend: is missing; devices are opened by backend = "hardware" above all tables')
     return config
 
 

@@ -87,7 +87,7 @@ class Characteristics:
         focal_px: at the shortest focal length.
         off_deg: rms angle between reported and seen positions, after scale and sign [degrees].
         missed_deg: largest distance of a reported position from the goal.
-        both_axes: whether it moves only where pan and tilt change both; None where that was not tried.
+        both_axes: whether it moves only where pan and tilt change both.
         light_s: from a command to the picture that shows the motion.
         report_s: from light to picture, less the time by which reported positions are late; None without reports.
         stop_s: from a halt to standing, less the time from a command to motion; None where it was not seen.

@@ -727,12 +727,9 @@ def config_of(text: str, path: Path) -> RigConfig:
         path: path of the file; relative paths are relative to its folder, and messages name it. It is not read.
 
     Raises:
-        ConfigError: the text is malformed, has an unknown key or an impossible value, or names devices without saying
-            that they are to be opened.
+        ConfigError: the text is malformed, or has an unknown key or an impossible value.
     """
-    table = _tables(text, path)
-    if "hardware" in table and "backend" not in table:  # the simulation would answer in place of the devices
-        raise ConfigError(f'{path}: backend: is missing; devices are opened by backend = "hardware" above all tables')
+    table = tables_of(text, path)
     try:
         config = parse_config(table, path.parent)
     except ConfigError as error:
@@ -747,7 +744,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: the file is missing or is not TOML.
     """
-    return _tables(read_text(path), path)
+    return tables_of(read_text(path), path)
 
 
 def read_text(path: Path) -> str:
@@ -769,7 +766,12 @@ def read_text(path: Path) -> str:
         raise ConfigError(f"{path}: is no text in UTF-8: {error.reason}; give the path of a rig.toml") from None
 
 
-def _tables(text: str, path: Path) -> dict[str, Any]:
+def tables_of(text: str, path: Path) -> dict[str, Any]:
+    """Parse the tables of a rig.toml's text without checking them.
+
+    Raises:
+        ConfigError: the text is not TOML; the message names the path.
+    """
     try:
         return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
