@@ -694,6 +694,7 @@ def _zoom_through(rig: Rig, room: Room, focal_px: float, say: Say, *, reports: b
         growths.append((reached, growths[-1][1] * found[0]))
         before = after
     rig.zoom.zoom(shortest)
+    wait_for_lens(rig)  # the halt at the end would stop it where it is
     return turns, tuple(growths), tuple(speeds)
 
 

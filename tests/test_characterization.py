@@ -69,6 +69,8 @@ def test_what_a_dome_does_is_measured_in_its_picture(seed):
             assert math.degrees(speed) > 20.0
     assert len(found.speeds) == 6
     assert found.missed_deg <= dome.round_deg / 2 + 1e-9
+    lens = dome.zoom.state()
+    assert (lens.focal_px, lens.moving) == (WIDE_PX, False)
 
 
 @pytest.mark.slow

@@ -80,7 +80,7 @@ def ask(consented: bool, question: str, refusal: str) -> None:
     """
     if consented:
         return
-    print(f"{question} [yes/no]", flush=True)
+    print(f"{question} [yes/no]", file=sys.stderr, flush=True)
     try:
         answer = sys.stdin.readline() if sys.stdin is not None else ""
     except (OSError, ValueError):  # closed terminal, closed file, or not text

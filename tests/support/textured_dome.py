@@ -132,7 +132,8 @@ class _Zoom:
         return focal_px
 
     def state(self):
-        return ZoomState(self.rig.zooms[-1][1], False, self.rig.t)
+        arrives, focal_px = self.rig.zooms[-1]
+        return ZoomState(focal_px, self.rig.t < arrives, self.rig.t)
 
 
 @dataclass
