@@ -1,9 +1,8 @@
 """Hard courses for one target: stops dead, sharp turns, gusts, an approach, and a wall that hides it for two seconds.
 
 A book is carried from 12 m to 5 m, a person runs from 30 m to 16 m, because nearer the view cuts off the feet, and a
-bird comes from 80 m to 6 m. Of random
-courses one is taken that stays in the fixed camera's view and that the head can follow with four fifths of its own
-speed and acceleration. The world's axes are those of `cotarget.sim.targets.paths`.
+bird comes from 80 m to 6 m. Of random courses one is taken that stays in the fixed camera's view and that the head can
+follow with four fifths of its own speed and acceleration. The world's axes are those of `cotarget.sim.targets.paths`.
 """
 
 import math
