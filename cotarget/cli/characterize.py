@@ -1,4 +1,4 @@
-"""Turn and zoom a dome, measure in its picture what it does, and print that for rig.toml: `cotarget characterize`."""
+"""Turn and zoom a dome, and print for rig.toml what its picture shows of it: `cotarget characterize > dome.toml`."""
 
 import argparse
 import itertools
