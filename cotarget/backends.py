@@ -63,7 +63,8 @@ def _check_times(config: "RigConfig") -> None:
             f"safety.watchdog_s: {safety.watchdog_s:g} s would halt the head between any two frames of the fixed "
             f"camera, which has {spec.fixed.rate_hz:g} a second"
         )
-    for name, camera in (("fixed", spec.fixed), ("zoom", spec.zoom)):
+    zoom = "ptz" if config.backend == "hardware" and config.hardware.ptz else "zoom"
+    for name, camera in (("fixed", spec.fixed), (zoom, spec.zoom)):
         if camera.latency_s >= safety.max_frame_age_s:
             raise ConfigError(
                 f"{config.backend}.{name}.latency_s: {camera.latency_s:g} s makes every frame older than "

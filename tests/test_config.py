@@ -261,6 +261,11 @@ def test_latency_above_the_frame_age_limit_is_refused(backend, camera):
     assert refused_hardware(f"{text}20").startswith(f"{backend}.{camera}.latency_s: ")
 
 
+def test_the_latency_of_a_dome_is_named_by_its_table():
+    text = "backend = 'hardware'\nhardware.ptz.driver = 'onvif'\nhardware.ptz.latency_s = 20"
+    assert refused_hardware(text).startswith("hardware.ptz.latency_s: ")
+
+
 @pytest.mark.parametrize(("url", "address"), [
     ("socket://10.0.0.2:4000", ("10.0.0.2", 4000)), ("socket://ptu.local:4000/", ("ptu.local", 4000)),
     ("socket://[::1]:80", ("::1", 80)), ("/dev/ttyUSB0", None), ("socket://host", None), ("socket://host:port", None),
