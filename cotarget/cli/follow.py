@@ -22,6 +22,7 @@ from cotarget.cli.pipeline_run import (
     LEARNT,
     RunInputs,
     Selection,
+    StepCounts,
     add_outputs,
     add_selection,
     output_files,
@@ -128,13 +129,19 @@ def _run(options: argparse.Namespace, opened_first: ExitStack) -> int:
             operated=operated,
             settings=settings,
         )
-        result = run_observed(run, options)
-        if result.interrupt is None:  # a run cut short may not have had the time to see anything
-            warn_if_unseen("follow", run, result.counts)
-        print_json(result.table, options.csv)
-        if result.interrupt is not None:
-            raise result.interrupt
-    return result.counts.exit_status if page is None else 0
+        counts = _follow(run, options)
+    return counts.exit_status if page is None else 0
+
+
+def _follow(run: RunInputs, options: argparse.Namespace) -> StepCounts:
+    """Follow, and print the summary; an interrupt is raised after it."""
+    result = run_observed(run, options)
+    if result.interrupt is None:  # a run cut short may not have had the time to see anything
+        warn_if_unseen("follow", run, result.counts)
+    print_json(result.table, options.csv)
+    if result.interrupt is not None:
+        raise result.interrupt
+    return result.counts
 
 
 def _settings(options: argparse.Namespace) -> "FollowSettings":

@@ -109,7 +109,7 @@ def run_observed(run: RunInputs, options: argparse.Namespace, *more: Observer) -
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
     from cotarget.pipeline import Run
-    from cotarget.recording.recorder import COLUMNS, step_row, utc_text
+    from cotarget.recording.recorder import COLUMNS, step_row
     from cotarget.recording.replay import until_end
     from cotarget.safety.signals import deferred_signals
     from cotarget.video import FilmWriter
@@ -156,17 +156,20 @@ def run_observed(run: RunInputs, options: argparse.Namespace, *more: Observer) -
         interrupt = end
     for line in filter(None, (observer.warning for observer in observers)):
         print(f"cotarget {options.command}: {line}", file=sys.stderr)
-    return Result(
-        counts,
-        {
-            "steps": counts.steps,
-            "skipped": counts.skipped,
-            "states": counts.states,
-            "reasons": reasons.table,
-            "started": None if epoch is None or not counts.steps else utc_text(epoch, counts.first_t),
-        },
-        interrupt,
-    )
+    return Result(counts, _summary(counts, reasons, epoch), interrupt)
+
+
+def _summary(counts: "StepCounts", reasons: "Reasons", epoch: datetime | None) -> dict[str, Any]:
+    """Make the table that a run prints; ``epoch`` is the wall clock's time at the rig's zero, if there is one."""
+    from cotarget.recording.recorder import utc_text
+
+    return {
+        "steps": counts.steps,
+        "skipped": counts.skipped,
+        "states": counts.states,
+        "reasons": reasons.table,
+        "started": None if epoch is None or not counts.steps else utc_text(epoch, counts.first_t),
+    }
 
 
 # What a detector needs to find a target.
