@@ -59,6 +59,7 @@ def run(options: argparse.Namespace) -> None:
             f"The dome will turn {pan} of pan and {tilt} of tilt, at up to {fastest:.0f} degrees/s, for two minutes, "
             "and the lens through its whole range. May it?",
             "nothing was turned",
+            sys.stderr,
         )
         found = characterize(rig, room, lambda line: print(line, file=sys.stderr, flush=True))
         if not found.moves:

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from cotarget.errors import ConfigError, naming
 from cotarget.files import STDOUT, behind_link, write_atomically
@@ -72,15 +72,21 @@ def check_board_size(rig: Path, config: "RigConfig") -> None:
 CONSENT = "yes"
 
 
-def ask(consented: bool, question: str, refusal: str) -> None:
+def ask(consented: bool, question: str, refusal: str, out: TextIO | None = None) -> None:
     """Ask for consent, unless --yes has given it.
 
+    Args:
+        consented: whether it has.
+        question: what is asked.
+        refusal: what is not done without consent.
+        out: takes the question; by default stdout, which a command with results there leaves to these.
+
     Raises:
-        ConfigError: the answer is not yes, or there is none; ``refusal`` says what was not done.
+        ConfigError: the answer is not yes, or there is none.
     """
     if consented:
         return
-    print(f"{question} [yes/no]", file=sys.stderr, flush=True)
+    print(f"{question} [yes/no]", file=out, flush=True)
     try:
         answer = sys.stdin.readline() if sys.stdin is not None else ""
     except (OSError, ValueError):  # closed terminal, closed file, or not text

@@ -16,6 +16,7 @@ POLL_S = 0.2
 # Python's switch interval [s]. With the default of 5 ms, a line that is paced by its own thread loses half of its rate
 # beside the rendering.
 SWITCH_S = 5e-4
+UNITS = "ptzoptics"  # of a VISCA dome
 TARGETS = ("person",)  # targets of the scene without a rig.toml
 NO_TARGET = 'none; [sim] targets = ["person"] has one to follow'
 
@@ -34,8 +35,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ptz", choices=("onvif", "visca"), help=about)
     about = "how the dome deviates from its standard: faults of ptz, listed below, without ptz"
     parser.add_argument("--profile", type=lambda text: text.split(","), default=[], metavar="NAME[,NAME]", help=about)
-    about = "units of a VISCA dome (ptzoptics)"
-    parser.add_argument("--units", choices=("ptzoptics", "evi_d70", "evi_d80"), help=about)
+    about = f"units of a VISCA dome ({UNITS})"
+    parser.add_argument("--units", choices=("ptzoptics", "evi_d70", "evi_d80"), default=UNITS, help=about)
     about = "connect the head by TCP instead of a serial port, or a VISCA dome instead of by UDP"
     parser.add_argument("--tcp", action="store_true", help=about)
     parser.add_argument("--user", default="", metavar="NAME", help="user name that cameras and dome ask for (none)")
@@ -68,7 +69,7 @@ def check_dome(options: argparse.Namespace) -> None:
     """Refuse what the dome of --ptz does not have."""
     if options.profile and not options.ptz:
         raise ConfigError("--profile: is of a dome; give --ptz onvif")
-    if options.units and options.ptz != "visca":
+    if options.units != UNITS and options.ptz != "visca":
         raise ConfigError("--units: is of a VISCA dome; give --ptz visca")
     if options.tcp and options.ptz == "onvif":
         raise ConfigError("--tcp: is of a PTU-D46 or a VISCA dome; ONVIF is over TCP without it")
@@ -105,7 +106,7 @@ def run(options: argparse.Namespace) -> None:
     password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
     if options.user and not password:
         raise ConfigError("--user needs a password: put it into the environment variable COTARGET_PASSWORD")
-    how = {"fixed": protocol, "dome": options.ptz or "", "units": options.units or "ptzoptics"}
+    how = {"fixed": protocol, "dome": options.ptz or "", "units": options.units}
     with Emulation(paced(config), ports, user=options.user, password=password, **how) as emulation:
         for fault in faults:
             emulation.switch(fault)

@@ -238,11 +238,9 @@ def resets(monkeypatch):
 def test_reset_head_with_consent_resets(folder, capsys, monkeypatch, resets, answer):
     monkeypatch.setattr("sys.stdin", io.StringIO(answer))
     status, out, err = call(capsys, "reset-head", "--rig", "hw.toml", *(["--yes"] if answer == "--yes" else []))
-    assert (status, resets) == (0, [NO_PORT])
-    assert len(out.splitlines()) == 1
-    assert out.startswith("reset: v2.12.1d1")
-    assert len(err.splitlines()) == (answer != "--yes")
-    assert ("camera and cables clear" in err) == (answer != "--yes")
+    assert (status, err, resets) == (0, "", [NO_PORT])
+    assert out.splitlines()[-1].startswith("reset: v2.12.1d1")
+    assert ("camera and cables clear" in out) == (answer != "--yes")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the devices have to refuse a second program")
