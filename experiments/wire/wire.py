@@ -89,25 +89,21 @@ def jobs(settings: WireSettings) -> Sequence[int]:
     return range(len(_measurements(settings)))
 
 
-def _measurements(settings: WireSettings) -> list[str]:
-    """List the figures, with "follow" replaced by the domes, and "characterize" by the seeds of those drawn."""
-    domes = settings.domes or tuple(follow.DOMES)
-    seeds = [str(settings.seed_base + i) for i in range(settings.drawn)]
-    several = {"follow": domes, "characterize": seeds}
-    return [name for figure in settings.only for name in several.get(figure, (figure,))]
+def _measurements(settings: WireSettings) -> list[tuple[str, Any]]:
+    """List each figure with its case: a dome that is followed with, or the seed of one that is characterized."""
+    cases: dict[str, Sequence[Any]] = {
+        "follow": settings.domes or tuple(follow.DOMES),
+        "characterize": range(settings.seed_base, settings.seed_base + settings.drawn),
+    }
+    return [(figure, case) for figure in settings.only for case in cases.get(figure, (None,))]
 
 
 def one(settings: WireSettings, number: int) -> list[Row]:
     """Measure one of the figures; give the rows of the last measurement, with its number if it was repeated."""
-    name = _measurements(settings)[number]
+    figure, case = _measurements(settings)[number]
     for time in range(1, settings.tries + 1):
         with TemporaryDirectory(prefix="cotarget-wire-") as folder:
-            if name in follow.DOMES:
-                rows = follow.run(Path(folder), name, settings.follow_s, settings.seed_base)
-            elif name.isdigit():
-                rows = characterize.run(Path(folder), int(name))
-            else:
-                rows = RUNS[name](settings, Path(folder))
+            rows = RUNS[figure](settings, Path(folder), case)
         if time == settings.tries or not _spoilt(rows):
             break
     return rows if time == 1 else [row | {AGAIN: time} for row in rows]
@@ -120,16 +116,18 @@ def _spoilt(rows: Sequence[Row]) -> bool:
     return bool(broken) and all(each.bound != NEVER for each in broken)
 
 
-RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
-    "polls": lambda s, folder: polls.run(folder, s.poll_s),
-    "age": lambda s, _: age.run(s.age_s, s.seed_base),
-    "stream_age": lambda s, _: age.run_h264(s.age_s, s.seed_base),
-    "command": lambda s, folder: command.run(folder, s.targets, s.command_s),
-    "faults": lambda s, folder: faults_module.run(
+RUNS: Mapping[str, Callable[[WireSettings, Path, Any], list[Row]]] = {
+    "polls": lambda s, folder, _: polls.run(folder, s.poll_s),
+    "age": lambda s, *_: age.run(s.age_s, s.seed_base),
+    "stream_age": lambda s, *_: age.run_h264(s.age_s, s.seed_base),
+    "command": lambda s, folder, _: command.run(folder, s.targets, s.command_s),
+    "faults": lambda s, folder, _: faults_module.run(
         folder, s.faults or faults_module.all_faults(), s.repetitions, s.seed_base
     ),
-    "latency": lambda s, folder: latency.run(folder, s.wiggle_s, s.swing_s),
-    "parity": lambda s, folder: parity.run(folder, s.places, s.still_s, s.seed_base),
+    "latency": lambda s, folder, _: latency.run(folder, s.wiggle_s, s.swing_s),
+    "parity": lambda s, folder, _: parity.run(folder, s.places, s.still_s, s.seed_base),
+    "follow": lambda s, folder, dome: follow.run(folder, dome, s.follow_s, s.seed_base),
+    "characterize": lambda s, folder, seed: characterize.run(folder, seed),
 }
 
 
