@@ -592,7 +592,7 @@ class OnvifLink(PtzLink):
             self.axes = self._find_axes()
             self._refuse_lost(status)
             self._reckoned = [ReckonedAxis(facts, settings.command_delay_s) for facts in self.axes]
-            delays = settings.command_delay_s, settings.stop_delay_s
+            delays = settings.command_delay_s, settings.stop_delay_s, device.answer_s
             self._steered = [SteeredAxis(facts, *delays) for facts in self.axes[:2]]
             self._stepped, self._speeds = (SteppedAxis(), SteppedAxis()), (0.0, 0.0)
             self._renewed, self._timeout_s = -math.inf, self._find_timeout()

@@ -82,6 +82,7 @@ class PolledHeadSettings:
 
 TRIES = 3  # of a move, and of polls in a row, that end because the unit was silent
 PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
+ANSWERS = 3  # for which a unit that answers late gets more time: one that is steered comes to its goal by some of them
 # A unit that reports no position for this time [s] and in so many polls is dead; a program may have been suspended.
 UNHEARD_S, UNHEARD_POLLS = 5.0, 10
 # A unit may obey late: a head that has stood for so long since the last command [s], and turns by this angle beyond its
@@ -253,7 +254,8 @@ class Loop:
             longest = max(longest, way / speed + 2 * axis.facts.braking_s(fastest))
         self._speeds = move.speeds
         self._expect_motion(self._head)
-        move.deadline = self._clock.now() + longest + self._delay + PATIENCE_S
+        patience = self._delay + PATIENCE_S + ANSWERS * self._link.answer_s
+        move.deadline = self._clock.now() + longest + patience
 
     def _zoom(self) -> None:
         self.lens_snapshot = replace(self.lens_snapshot, moving=True)  # before the request leaves the queue, as a move

@@ -79,14 +79,17 @@ class SteeredAxis:
         facts: of the axis.
         delay: time from a command to the start of motion [s].
         stop_delay: time by which a stop takes longer [s].
+        answer: time that the device takes for an answer [s]. A command is obeyed within it, and a position is as old at
+            most.
     """
 
-    def __init__(self, facts: AxisFacts, delay: float, stop_delay: float = 0.0) -> None:
-        self._facts, self._delay, self._stop_delay = facts, delay, stop_delay
+    def __init__(self, facts: AxisFacts, delay: float, stop_delay: float = 0.0, answer: float = 0.0) -> None:
+        self._facts, self._delay, self._stop_delay = facts, max(delay, answer), stop_delay
+        self._gain = 1 / (1 / GAIN_HZ + 2 * answer)
         self._sent = deque([(0.0, 0.0)], maxlen=100)  # (time, velocity)
         self._goal: float | None = None
         self._limit, self._flow, self._aimed = facts.fastest, 0.0, -FLOW_S
-        self._slow = min(GAIN_HZ * facts.slack, SLOW * facts.fastest)
+        self._slow = min(self._gain * facts.slack, SLOW * facts.fastest)
         self._tolerance = self._least = max(facts.slack / 2, facts.same)
         self._swings = 0  # times that it has gone beyond the goal of now
         self._turned = 0.0  # the velocity with which it last began to go to the goal of now
@@ -128,13 +131,13 @@ class SteeredAxis:
         if not self._facts.lowest < goal < self._facts.highest:
             goal, flow = min(max(goal, self._facts.lowest), self._facts.highest), 0.0
         here, coast = self._predicted(position, t, now)
-        gain = GAIN_HZ
+        gain = self._gain
         if not flow:
             left = goal - here - coast
             passes = left * coast < 0 < (goal - here) * coast
             if abs(left) <= self._tolerance or (coast and (self.velocity == 0 or passes)):
                 return 0.0
-            gain = 1 / (1 / GAIN_HZ + self._stop_delay)
+            gain = 1 / (1 / self._gain + self._stop_delay)
         elif abs(goal - here) <= self._tolerance and abs(flow) < self._slow:
             return 0.0
         wanted = min(max(flow + gain * (goal - here), -self._limit), self._limit)

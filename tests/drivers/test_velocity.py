@@ -114,6 +114,27 @@ def test_an_axis_of_which_nobody_knows_that_it_turns_on_comes_to_rest_too():
     assert max(places[-200:]) == min(places[-200:]) == pytest.approx(30.0, abs=0.6)
 
 
+@pytest.mark.parametrize(("answer", "obeyed", "read"), [
+    (answer, obeyed, read) for answer in (0.2, 0.3, 0.5) for obeyed in (0.0, 1.0) for read in (0.0, 1.0)
+])  # fmt: skip
+def test_an_axis_of_a_device_that_answers_late_comes_to_rest_at_its_goal(answer, obeyed, read):
+    """Whatever part of the time for an answer has passed when it obeys, and when it reads its position."""
+    axis, places, orders, free = SteeredAxis(FACTS, DELAY_S, answer=answer), [0.0], [(-1.0, 0.0)], 0.0
+    axis.aim(60.0, 50.0, 0.0)
+    for i in range(2000):
+        now = i / 100
+        velocity = next(v for t, v in reversed(orders) if t <= now)
+        places.append(places[-1] + velocity / 100)
+        if now >= free:  # each command and each position is one exchange
+            t = now - (1.0 - read) * answer
+            wanted = axis.wanted(places[max(round(100 * t), 0)], now, now)
+            if wanted != axis.velocity:
+                axis.send(wanted, now)
+                orders.append((now + obeyed * answer + DELAY_S, wanted))
+            free = now + answer
+    assert max(places[-300:]) == min(places[-300:]) == pytest.approx(60.0, abs=2 * FACTS.slack)
+
+
 def test_a_goal_that_is_given_again_moves_no_more():
     """As at a soft limit."""
     axis = SteeredAxis(FACTS, 0.0)
