@@ -17,6 +17,10 @@ class SilentError(DeviceError):
     """The unit did not answer in time."""
 
 
+class AwayError(SilentError):
+    """Nothing listens at the unit's address: it has gone, or starts anew."""
+
+
 class ReplyError(DeviceError):
     """What arrived is no answer of the unit to the command."""
 

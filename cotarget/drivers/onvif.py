@@ -30,7 +30,7 @@ from xml.sax.saxutils import escape
 from cotarget.drivers.axes import AXES, AxisFacts, Poll
 from cotarget.drivers.guardian import StopOrder
 from cotarget.drivers.head_link import Pair, Requests
-from cotarget.drivers.link_errors import CutError, RefusedError, SilentError
+from cotarget.drivers.link_errors import AwayError, CutError, RefusedError, SilentError
 from cotarget.drivers.polled_head import UNHEARD_S
 from cotarget.drivers.ptz import Dome, PtzLink, PtzSettings, lens_positions
 from cotarget.drivers.soap import (
@@ -71,7 +71,7 @@ REMEDY = "close its page and other programs that ask it, and check the network"
 SLOW_S = 0.1  # an answer that usually takes longer is named [s]
 LOOK_S = 0.01  # period of looking for a halt during a command [s]
 STATUS_PAUSE_S = 0.03  # between the answer to a status and the next question [s]
-STATUS_TRIES = 3  # failed statuses in a row, after which the device has gone
+STATUS_TRIES = 3  # failed statuses in a row, after which the device has gone; one where nothing listens
 RETRY_S = 0.2  # pause after a failed status [s]
 RIGHTS = "moving takes the rights of an operator or administrator"
 STILL_S = 0.3  # whether a device says that it moves cannot be believed; it stands after this time in one place [s]
@@ -80,9 +80,10 @@ LATEST_S = 0.02  # a status that takes longer is of its end [s]
 TIMEOUT_S = 1.0  # a continuous move ends by itself after this time, where the device can that [s]
 WORKERS = 8  # commands that may be under way at the same time
 FINE = 0.02  # velocities are sent again where they change by more, as a share of the highest
-BEYOND = 0.5  # of a range: one of 360 degrees may be counted from -180 or from 0
 ZOOM_STEPS = 1000  # in which the range of the zoom's number is divided
-OUTSIDE_DEG = 5.0  # this far beyond the device's own range, a position is lost
+# This far beyond the device's own range, a position is lost; a digital zoom goes on where that of the lens ends.
+OUTSIDE_DEG, ZOOM_OUTSIDE = 5.0, 0.5
+ONCE = ("RelativeMove",)  # commands that move the device twice if it gets them twice
 ZOOM_SLACK = 0.01  # of that range, by which the reported number may be off
 
 
@@ -338,7 +339,7 @@ class OnvifDevice:
     def command(self, message: str, inner: str, timeout: float) -> None:
         """Send a command; raises as `SoapClient.call` does. Some devices answer with success alone."""
         with contextlib.suppress(EmptyAnswerError):
-            self.soap.call(self._ptz, PTZ, message, self._token + inner, timeout)
+            self.soap.call(self._ptz, PTZ, message, self._token + inner, timeout, once=message in ONCE)
 
     def order(self, message: str, inner: str) -> StopOrder:
         """Write a command for a `Guardian`; the login goes with it only where the device asks for HTTP digest."""
@@ -526,7 +527,8 @@ class StatusReader:
                 self._newest, failed = self._ask(), 0
             except DeviceError as error:
                 failed += 1
-                if failed == STATUS_TRIES:
+                # One that starts anew may come back with other positions.
+                if failed == STATUS_TRIES or isinstance(error, AwayError):
                     self._error = error
                     return
             except Exception as error:  # without its thread the head would look healthy
@@ -588,9 +590,8 @@ class OnvifLink(PtzLink):
             status = device.status()
             self._way = self._refuse_unable(status)
             self._coordinates = self._find_coordinates(status)
-            self._refuse_strange(status)
-            self.axes = self._find_axes()
             self._refuse_lost(status)
+            self.axes = self._find_axes()
             self._reckoned = [ReckonedAxis(facts, settings.command_delay_s) for facts in self.axes]
             delays = settings.command_delay_s, settings.stop_delay_s, device.answer_s
             self._steered = [SteeredAxis(facts, *delays) for facts in self.axes[:2]]
@@ -727,15 +728,19 @@ class OnvifLink(PtzLink):
             found.append(Coordinate(numbers, numbers if own_degrees else ends))
         return found[0], found[1], Coordinate(ranges[2], ranges[2])
 
-    def _refuse_strange(self, status: Status) -> None:
-        """Refuse positions that are far beyond their ranges: lost ones, or such in other numbers."""
-        for word, number, coordinate in zip(("pan", "tilt", "zoom"), status[:3], self._coordinates, strict=True):
+    def _refuse_lost(self, status: Status) -> None:
+        """Refuse a position outside of the device's own range: it is lost, or in other numbers.
+
+        To steer by it would lead to an end, and a move from it would not be over.
+        """
+        pan, tilt, zoom = self._coordinates
+        beyond = pan.way(OUTSIDE_DEG), tilt.way(OUTSIDE_DEG), ZOOM_OUTSIDE * (zoom.numbers[1] - zoom.numbers[0])
+        for word, at, coordinate, most in zip(AXES, status[:3], self._coordinates, beyond, strict=True):
             lowest, highest = coordinate.numbers
-            beyond = BEYOND * (highest - lowest)
-            if number is not None and not lowest - beyond <= number <= highest + beyond:
+            if at is not None and not lowest - most <= at <= highest + most:
                 raise DeviceError(
-                    f"{self._who} says that {word} is at {number:g}, far from its range of {lowest:g} to {highest:g}: "
-                    "switch it off and on, so that it finds its limits; if it says so again, it is not driven"
+                    f"{self._who} says that {word} is at {at:.4g}, outside of its own range from {lowest:g} to "
+                    f"{highest:g}: its position is lost; switch it off and on, so that it finds its limits"
                 )
 
     def _limits_space(self, status: Status) -> Space:
@@ -825,16 +830,6 @@ class OnvifLink(PtzLink):
                 reckoned.correct(position, status.t)
                 polls.append(Poll(i, position, status.t))
         return polls
-
-    def _refuse_lost(self, status: Status) -> None:
-        """Raise where a position is outside of the device's own range: to steer by it would lead to an end."""
-        for word, position, axis in zip(("pan", "tilt"), self._positions(status), self.axes, strict=False):
-            lowest, highest = axis.lowest - OUTSIDE_DEG, axis.highest + OUTSIDE_DEG
-            if position is not None and not lowest <= position <= highest:
-                raise DeviceError(
-                    f"{self._who} says that its {word} is at {position:.1f} degrees, outside of its own range from "
-                    f"{axis.lowest:g} to {axis.highest:g}: its position is lost; switch it off and on"
-                )
 
     def _refuse_silence(self, axis: int, now: float) -> None:
         """Raise where an axis says no position any more, though it should stand, and no status was late before."""

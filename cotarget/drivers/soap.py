@@ -17,12 +17,12 @@ import time
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from email.utils import parsedate_to_datetime
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 from xml.sax.saxutils import escape
 
 from cotarget.drivers.axis import import_httpx
-from cotarget.drivers.link_errors import SilentError
+from cotarget.drivers.link_errors import AwayError, SilentError
 from cotarget.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -157,6 +157,24 @@ def device_time(root: Element) -> datetime | None:
 # The client
 
 
+class Message(NamedTuple):
+    """A message of a service.
+
+    Attributes:
+        path: of the service, such as `DEVICE_PATH`.
+        namespace: of the service.
+        name: local name of the request.
+        inner: what the request contains, as XML; the prefix "t" is ONVIF's schema.
+        once: whether it is not sent again where the connection breaks, since the device may have obeyed it.
+    """
+
+    path: str
+    namespace: str
+    name: str
+    inner: str = ""
+    once: bool = False
+
+
 class SoapClient:
     """Send messages to a device, from any thread; calls that run at the same time have connections of their own.
 
@@ -197,36 +215,40 @@ class SoapClient:
         """By how much the device's clock is ahead of this machine's, as far as it was asked [s]."""
         return self._offset_s or 0.0
 
-    def call(self, path: str, namespace: str, message: str, inner: str = "", timeout: float = 5.0) -> Element:
+    def call(
+        self, path: str, namespace: str, name: str, inner: str = "", timeout: float = 5.0, *, once: bool = False
+    ) -> Element:
         """Send a message and return its answer.
 
         Args:
-            path: of the service, such as `DEVICE_PATH`.
-            namespace: of the service.
-            message: local name of the request.
-            inner: what the request contains, as XML; the prefix "t" is ONVIF's schema.
+            path: see `Message`.
+            namespace: see `Message`.
+            name: see `Message`.
+            inner: see `Message`.
             timeout: for the whole answer [s].
+            once: see `Message`.
 
         Raises:
             LoginFaultError: the user is refused; the message says how far off the device's clock is.
             FaultError: the device answered with a fault.
+            AwayError: nothing listens at its port.
             SilentError: the device cannot be reached, or there was no whole answer in time.
             EmptyAnswerError: the answer is empty, and its status success.
             DeviceError: the answer is none.
         """
-        deadline = time.monotonic() + timeout
+        deadline, message = time.monotonic() + timeout, Message(path, namespace, name, inner, once)
         if self._user and self._offset_s is None:
             self._offset_s = self._ask_clock(deadline)
         try:
-            return self._exchange(path, namespace, message, inner, deadline)
+            return self._exchange(message, deadline)
         except LoginFaultError as error:
             if self._user:
                 before, self._offset_s = self.clock_off_s, self._ask_clock(deadline)  # it may have been set since
                 # Devices lock a user who is refused often.
                 if abs(self._offset_s - before) > CLOCK_STEP_S:
                     with contextlib.suppress(LoginFaultError):
-                        return self._exchange(path, namespace, message, inner, deadline)
-            raise LoginFaultError(self.name, message, error.codes, self._why_refused()) from None
+                        return self._exchange(message, deadline)
+            raise LoginFaultError(self.name, name, error.codes, self._why_refused()) from None
 
     def _why_refused(self) -> str:
         if not self._user:
@@ -239,25 +261,26 @@ class SoapClient:
         """Ask for the device's time; return by how much it is ahead [s]."""
         found: datetime | None = None
         try:
-            root, found = self._post(DEVICE_PATH, DEVICE, "GetSystemDateAndTime", "", "", deadline)
+            root, found = self._post(Message(DEVICE_PATH, DEVICE, "GetSystemDateAndTime"), "", deadline)
             found = device_time(root) or found
         except FaultError:
             found = self._date
         # Devices say whole seconds.
         return 0.0 if found is None else (found - datetime.now(UTC)).total_seconds() + 0.5
 
-    def signed(self, path: str, namespace: str, message: str, inner: str = "") -> bytes:
+    def signed(self, path: str, namespace: str, name: str, inner: str = "") -> bytes:
         """Write a message with its HTTP header, for another connection, which is closed after the answer.
 
         It is signed for now: devices take it for some seconds or minutes. Arguments are those of `call`.
         """
-        request = next(self._auth.sync_auth_flow(self._request(path, namespace, message, inner, self._header())))
+        message = Message(path, namespace, name, inner)
+        request = next(self._auth.sync_auth_flow(self._request(message, self._header())))
         headers = {**request.headers, "connection": "close"}
         lines = [f"POST {path} HTTP/1.1", *(f"{name}: {value}" for name, value in headers.items()), "", ""]
         return "\r\n".join(lines).encode() + bytes(request.content)
 
-    def _exchange(self, path: str, namespace: str, message: str, inner: str, deadline: float) -> Element:
-        return self._post(path, namespace, message, inner, self._header(), deadline)[0]
+    def _exchange(self, message: Message, deadline: float) -> Element:
+        return self._post(message, self._header(), deadline)[0]
 
     def _header(self) -> str:
         """Write the security header of now; empty without a user."""
@@ -266,38 +289,35 @@ class SoapClient:
         created = datetime.now(UTC) + timedelta(seconds=self.clock_off_s)
         return user_token(self._user, self._password, created, os.urandom(16))
 
-    def _request(self, path: str, namespace: str, message: str, inner: str, header: str) -> "httpx.Request":
+    def _request(self, message: Message, header: str) -> "httpx.Request":
+        name, namespace = message.name, message.namespace
         data = (
             f'<?xml version="1.0" encoding="utf-8"?><s:Envelope xmlns:s="{ENVELOPE}">{header}<s:Body>'
-            f'<{message} xmlns="{namespace}" xmlns:t="{SCHEMA}">{inner}</{message}></s:Body></s:Envelope>'
+            f'<{name} xmlns="{namespace}" xmlns:t="{SCHEMA}">{message.inner}</{name}></s:Body></s:Envelope>'
         )
-        kind = f'application/soap+xml; charset=utf-8; action="{namespace}/{message}"'
-        return self._client.build_request("POST", path, content=data.encode(), headers={"Content-Type": kind})
+        kind = f'application/soap+xml; charset=utf-8; action="{namespace}/{name}"'
+        return self._client.build_request("POST", message.path, content=data.encode(), headers={"Content-Type": kind})
 
-    def _post(
-        self, path: str, namespace: str, message: str, inner: str, header: str, deadline: float
-    ) -> tuple[Element, datetime | None]:
+    def _post(self, message: Message, header: str, deadline: float) -> tuple[Element, datetime | None]:
         """Send an envelope; return the root of the answer, and the time in its header `Date`."""
-        httpx = self._httpx
-        with self._one_line_errors(message):
-            request = self._request(path, namespace, message, inner, header)
+        httpx, name = self._httpx, message.name
+        with self._one_line_errors(name):
+            request = self._request(message, header)
             steps = self._auth.sync_auth_flow(request)
             with contextlib.suppress(StopIteration):
                 request = next(steps)
                 while True:  # here, since the client would read the answer to a refused request without our limits
                     left_s = max(deadline - time.monotonic(), 0.05)
                     request.extensions["timeout"] = httpx.Timeout(left_s, connect=min(CONNECT_S, left_s)).as_dict()
-                    response = self._send(request, message)
+                    response = self._send(request, message.once)
                     with contextlib.closing(response):
-                        said = self._read(response, message, deadline)
+                        said = self._read(response, name, deadline)
                     if self._client.is_closed:  # its pool does not know a connection that was made meanwhile
                         response.extensions["network_stream"].close()
                     request = steps.send(response)
         self._date = _date(response.headers)
         if response.is_success and not said.strip():
-            raise EmptyAnswerError(
-                f"{self.name} answers {message} by nothing: check that ONVIF is on, and host and port"
-            )
+            raise EmptyAnswerError(f"{self.name} answers {name} by nothing: check that ONVIF is on, and host and port")
         if response.has_redirect_location:
             raise DeviceError(
                 f"{self.name} sends on to {quote(response.headers['location'])}: if that is the device, write its host "
@@ -307,23 +327,23 @@ class SoapClient:
             root = parse_xml(said)
         except ValueError as error:
             if response.status_code == 401:
-                raise LoginFaultError(self.name, message, (NOT_AUTHORIZED,), "HTTP status 401") from None
+                raise LoginFaultError(self.name, name, (NOT_AUTHORIZED,), "HTTP status 401") from None
             what = f"HTTP status {response.status_code}" if response.status_code != 200 else f"no SOAP ({error})"
             raise DeviceError(
-                f"{self.name} answers {message} by {what}: check that ONVIF is on, and host and port"
+                f"{self.name} answers {name} by {what}: check that ONVIF is on, and host and port"
             ) from None
-        if fault := fault_of(root, self.name, message):
+        if fault := fault_of(root, self.name, name):
             raise fault
         if response.status_code == 401:
-            raise LoginFaultError(self.name, message, (NOT_AUTHORIZED,), "HTTP status 401")
+            raise LoginFaultError(self.name, name, (NOT_AUTHORIZED,), "HTTP status 401")
         if find(root, "Body") is None:
-            raise DeviceError(f"{self.name} answers {message} by no SOAP: check that ONVIF is on, and host and port")
+            raise DeviceError(f"{self.name} answers {name} by no SOAP: check that ONVIF is on, and host and port")
         return root, self._date
 
-    def _send(self, request: "httpx.Request", message: str) -> "httpx.Response":
-        """Send a request; once more where the device has closed a connection that was kept, as some do each time."""
+    def _send(self, request: "httpx.Request", once: bool) -> "httpx.Response":
+        """Send a request; again where the device has closed a connection that was kept, as some do each time."""
         httpx = self._httpx
-        if message != "RelativeMove":  # which may have been obeyed
+        if not once:
             with contextlib.suppress(httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
                 return self._client.send(request, stream=True)
         return self._client.send(request, stream=True)
@@ -347,8 +367,10 @@ class SoapClient:
         except httpx.ConnectTimeout:
             raise SilentError(f"{self.name} does not answer: check host and port, its power and the network") from None
         except httpx.ConnectError as error:
-            why = _root_of(error)
-            raise SilentError(
+            root = _root_of(error)
+            kind = AwayError if isinstance(root, ConnectionRefusedError) else SilentError
+            why = getattr(root, "strerror", None) or quote(str(root)) or type(root).__name__
+            raise kind(
                 f"{self.name} cannot be reached ({why}): check host and port, its power and the network"
             ) from None
         except httpx.TimeoutException:
@@ -360,10 +382,10 @@ class SoapClient:
             raise SilentError(f"{self.name} broke off at {message} ({why}): check host and port") from None
 
 
-def _root_of(error: BaseException) -> str:
+def _root_of(error: BaseException) -> BaseException:
     while (inner := error.__cause__ or error.__context__) is not None:
         error = inner
-    return getattr(error, "strerror", None) or quote(str(error)) or type(error).__name__
+    return error
 
 
 def _date(headers: Mapping[str, str]) -> datetime | None:

@@ -115,6 +115,18 @@ def test_relative_moves_lead_to_positions_whatever_a_step_of_1_is(profiles):
         assert not unit.turning()
 
 
+def test_a_relative_move_that_was_obeyed_and_not_answered_is_not_sent_again(monkeypatch):
+    def obey(number, usual, *about):
+        usual(*about)
+        raise ConnectionError
+
+    counted(monkeypatch, "RelativeMove", obey)
+    with OnvifUnit("relative-only") as unit, opened(unit) as dome:
+        with pytest.raises(DeviceError, match="broke off at RelativeMove"):
+            dome.head.move(math.radians(20.0), 0.0, wait=True)
+        assert unit.moves == ["RelativeMove"]
+
+
 def test_a_head_that_another_program_moves_is_reported_once_and_left_alone(caplog):
     with OnvifUnit() as unit, opened(unit) as dome:
         dome.head.move(math.radians(10.0), 0.0, wait=True)
@@ -348,6 +360,23 @@ def test_a_device_that_goes_away_is_an_error_of_one_line():
         unit.faults.set("refuse", False)
 
 
+def test_a_steered_device_that_starts_anew_at_another_position_is_not_driven_on():
+    with OnvifUnit("continuous-only") as unit, opened(unit) as dome:
+        dome.head.move(math.radians(140.0), 0.0, speed=math.radians(20.0))
+        wait_for(lambda: unit.pan.degrees() > 3.0)
+        unit.server.close()
+        for axis in (unit.pan, unit.tilt):
+            axis.command(round(-100.0 / STEP_DEG), 1e6, 1e9)
+        time.sleep(AWAY_S)
+        unit.listen(unit.server.port)
+        begin = time.monotonic()
+        assert "cannot be reached (Connection refused)" in fails(dome.head.state)
+        assert time.monotonic() < begin + STOPS_S
+        time.sleep(STOPS_S)
+        assert unit.pan.degrees() == pytest.approx(-100.0, abs=20.0 * STOPS_S)
+        assert not unit.turning()
+
+
 @pytest.mark.parametrize("fault", ["silence", "garbage", "half-answers", "not-soap", "endless", "bomb", "unauthorized"])
 def test_a_fault_in_mid_move_is_an_error_of_one_line(fault, monkeypatch):
     monkeypatch.setattr(onvif, "STATUS_S", 1.0)
@@ -530,7 +559,7 @@ def test_a_steered_dome_that_loses_its_position_is_stopped_and_named():
         dome.head.move(math.radians(60.0), 0.0, speed=math.radians(40.0))
         wait_for(lambda: unit.pan.degrees() > 5.0)
         unit.faults.set("position-lost")
-        assert "outside of its own range from -150 to 170: its position is lost" in fails(dome.head.state)
+        assert "outside of its own range from -1 to 1: its position is lost" in fails(dome.head.state)
         time.sleep(SETTLED_S)
         assert not unit.turning()
         assert 5.0 < unit.pan.degrees() < 60.0
@@ -715,7 +744,7 @@ def test_a_table_outside_of_the_devices_range_is_refused_and_nothing_stays_open(
     ("presets-only", "has neither absolute moves nor velocities, only presets: it is not driven"),
     ("continuous-only,no-status", "can only be moved by velocities, and does not say where it is: it is not driven"),
     ("no-zoom", "says that zoom goes from 1 to 1"),
-    ("position-lost", r"its pan is at 176.0 degrees, outside of its own range from -150 to 170: its position is lost"),
+    ("position-lost", r"pan is at 1.038, outside of its own range from -1 to 1: its position is lost; switch it off"),
     ("unauthorized", "not for the user 'root': check hardware.ptz.user and the password"),
     ("silence", "did not answer GetSystemDateAndTime in time"), ("refuse", "broke off|cannot be reached"),
     ("garbage", "no SOAP"), ("half-answers", "broke off"), ("not-soap", "no SOAP"), ("bomb", "it has a document type"),
@@ -727,11 +756,14 @@ def test_a_dome_that_cannot_be_driven_is_named_in_one_line(profile, said, monkey
         assert re.search(said, refused(unit))
 
 
-def test_a_position_far_from_its_range_is_refused(monkeypatch):
-    """Of an axis that has lost its position, or counts in other numbers."""
-    monkeypatch.setattr(OnvifCamera, "position", lambda camera: (557.4, 0.0, 0.0))
+@pytest.mark.parametrize(("position", "said"), [
+    ((557.4, 0.0, 0.0), "pan is at 557.4, outside of its own range from -1 to 1"),
+    ((0.0, 0.0, 30.0), "the lens is at 30, outside of its own range from 0 to 1"),
+])  # fmt: skip
+def test_a_position_in_other_numbers_is_refused(position, said, monkeypatch):
+    monkeypatch.setattr(OnvifCamera, "position", lambda camera: position)
     with OnvifUnit() as unit:
-        assert "says that pan is at 557.4, far from its range of -1 to 1: switch it off and on" in refused(unit)
+        assert f"says that {said}: its position is lost; switch it off and on" in refused(unit)
 
 
 def test_an_address_of_a_service_that_is_none_is_named(monkeypatch):
