@@ -7,7 +7,8 @@ several pans and tilts are related by rotations alone.
   adjustment over features, SIFT). The rotations against the reported angles give sign and scale of both axes.
 - The fixed camera's picture, which counts as upright, shows whether the dome's is upside down or mirrored. The dome's
   picture alone cannot: upside down, it looks like a picture whose axes both turn the other way.
-- Slow turns to and fro give the time from a command to the motion in the picture; halted turns give the time to stand.
+- Slow turns that are halted on their way give the time from a command to the motion in the picture, and the time to
+  stand.
 - Pictures at successive zoom positions give the growth from one to the next.
 
 The time from light to a picture and the time from a command to motion are seen as their sum alone. Where positions are
@@ -32,7 +33,7 @@ from scipy.spatial.transform import Rotation
 from cotarget.calibration.recorder import wait_for_lens
 from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, StaleFrameError
 from cotarget.geometry import Array
-from cotarget.latency import AGREEMENT, delay_between
+from cotarget.latency import AGREEMENT, LONGEST_DELAY, delay_between
 from cotarget.rig import Angles, Frame, Image, PanTiltState, Rig
 
 Say = Callable[[str], None]
@@ -44,7 +45,7 @@ LENS_STANDS_S = 0.8  # longest delay of a picture, after the lens has come to re
 STILL_PX, STILL_S = 0.25, 0.5  # the picture stands if its corners move by no more from frame to frame for so long
 UNMOVED_S = 3.0  # a picture that has not moved for so long after a command does not move [s]
 BACK_S = 5.0  # longest time without a frame [s]
-RESTLESS_S, TURNS_S = 15.0, 5.0  # longest time on the way to a place, and of a slow turn [s]
+RESTLESS_S = 15.0  # longest time on the way to a place [s]
 SLOWEST_S = 60.0  # longest time to wait for a picture that stands [s]
 CORNERS, WEAKEST, APART_PX = 200, 0.01, 8
 # Where the dome looks: parts of the field of view from the middle; each changes both axes.
@@ -62,13 +63,19 @@ LEVER, LEVER_SIGMA, NEARNESS = np.array([0.0, 0.0, 1.0]), 0.3, 0.03
 MOST_STEPS = 60
 RATIO = 0.75  # of the distances to the nearest and the second nearest feature (Lowe)
 OFF_PX = 4.0  # from the homography, which leaves out distortion
-RAMP_DEG, RAMP_DEG_S = 4.0, 6.0  # way and speed of slow turns in pan
+# Slow turns: way to their goal, and speed, in pan. They are halted before the half of it, since a steered dome slows
+# down at its goal.
+SLOW_DEG, SLOW_DEG_S = 18.0, 6.0
 TILTED = 0.25  # tilt of these turns, as a part of pan: both axes take the same time
-PHASES_S = (0.0, 0.041, 0.013, 0.061, 0.027, 0.087)  # of slow turns: between a frame and the command
-STOPPED_DEG, HALTS_S = 18.0, (0.9, 1.03, 0.97)  # way of a turn that is halted, and when
+PHASES_S = (0.0, 0.041, 0.013, 0.061, 0.027, 0.087)  # between a frame and their command
+HALTS_S = (0.9, 1.03, 0.97)  # from the command to the halt
+HALTED_S = 1.5  # longest time for which a halted dome turns on, and its driver obeys no move [s]
+BESIDE = 0.05  # of the way of a turn: a picture that seems farther off it was taken for one like it
 WHOLE = 0.95  # part of that way beyond which it was not halted
+ALONE_DEG = 4.0  # way of a move of pan alone
 LATEST_S = 2.0  # longest time from a command to the motion in the picture [s]
 LOOK_S = 0.01  # longest wait for a frame before the head's state is read again [s]
+APART_S = 100.0  # between turns, where they are compared with reports as if they followed each other [s]
 ZOOM_STEPS = 16
 # The highest speed is seen at every third of these, by a turn of such a way, that is halted after such a time; with it
 # goes a little tilt, for a dome that moves only where both axes change.
@@ -176,10 +183,9 @@ def characterize(rig: Rig, room: Room, say: Say) -> Characteristics:
     signs = (-1.0 if backward[0] != backward[1] else 1.0), (-1.0 if backward[0] else 1.0)
     missed = max(max(abs(view.state.pan - view.goal[0]), abs(view.state.tilt - view.goal[1])) for view in views)
     say("timing the motion")
-    light_s, report_s, rate = _time_starts(rig, room, focal_px)
-    stop_s = _time_stops(rig, room, focal_px, rate, abs(scale[0]))
+    light_s, report_s, stop_s = time_turns(rig, room, focal_px, abs(scale[0]))
     _go(rig, room.middle)
-    both_axes = not _go(rig, (room.middle[0] + math.radians(RAMP_DEG), room.middle[1]))[1]
+    both_axes = not _go(rig, (room.middle[0] + math.radians(ALONE_DEG), room.middle[1]))[1]
     say("zooming")
     turns, growths, speeds = _zoom_through(rig, room, focal_px, say, reports=report_s is not None)
     return Characteristics(
@@ -488,84 +494,90 @@ def orientation_of(images: Sequence[Image], fixed: Image) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Turn:
-    """Frames of a turn, and how far the picture has moved in each.
+    """A turn that was halted: its frames, and how far the picture has moved in each.
 
     Attributes:
         t: time of the command [s].
+        halted_s: time of the halt after the command [s].
         times: of the frames [s], (n,).
         angles: by which the picture has moved since the command [rad], (n,).
-        halted_s: time of the halt after the command [s]; nan without one.
+        states: of the head.
     """
 
     t: float
+    halted_s: float
     times: Array
     angles: Array
-    halted_s: float = math.nan
+    states: Sequence[PanTiltState]
 
     @property
     def way(self) -> float:
         """Angle by which it has moved in the end [rad]."""
-        return float(np.median(self.angles[-5:]))
+        return _end(self.angles)
 
 
-def _turn(
-    rig: Rig,
-    goal: Angles,
-    focal_px: float,
-    states: list[PanTiltState],
-    phase_s: float = 0.0,
-    halt_s: float | None = None,
-) -> _Turn:
-    """Turn slowly to a goal from where the picture stands, and watch until it stands again.
+def _end(angles: Array) -> float:
+    return float(np.median(angles[-5:]))
+
+
+def _turn(rig: Rig, goal: Angles, focal_px: float, phase_s: float, halt_s: float) -> _Turn:
+    """Turn slowly towards a goal from where the picture stands, halt, and watch until it stands again.
 
     Args:
         rig: the rig.
         goal: pan and tilt [rad].
         focal_px: focal length [px].
-        states: takes the head's states.
         phase_s: time between a frame and the command [s].
         halt_s: time after the command at which the head is halted [s].
     """
-    frame = _next(rig, _next(rig))
+    frame, rests = _next(rig), rig.clock.now() + HALTED_S
+    while rig.clock.now() < rests:
+        frame = _next(rig, frame)
     rig.clock.sleep_until(rig.clock.now() + phase_s)
-    rate, t = math.radians(RAMP_DEG_S), rig.clock.now()
+    rate, t = math.radians(SLOW_DEG_S), rig.clock.now()
     _patiently(lambda: rig.head.move(*goal, speed=(rate, rate * TILTED)))
-    frames, moved, still, halted_s, halts_at = [(frame.t, _grey(frame.image))], False, t, math.nan, t + TURNS_S
+    frames, states, moved, still, halted_s = [(frame.t, _grey(frame.image))], list[PanTiltState](), False, t, math.nan
     while rig.clock.now() < t + SLOWEST_S:
-        if halt_s is None and rig.clock.now() > halts_at:  # see `_settled`
+        if math.isnan(halted_s) and rig.clock.now() >= t + halt_s:
+            halted_s = rig.clock.now() - t
             _patiently(rig.head.halt)
-            halts_at = math.inf
-        if halt_s is not None and rig.clock.now() >= t + halt_s:
-            halted_s, halt_s = rig.clock.now() - t, None
-            rig.head.halt()
         states.append(_patiently(rig.head.state))
         with contextlib.suppress(StaleFrameError):
             frame = rig.zoom.read(newer_than=frame.t, timeout=LOOK_S)
             frames.append((frame.t, _grey(frame.image)))
             if _motion(frames[-2][1], frames[-1][1]) > STILL_PX:
                 moved, still = True, rig.clock.now()
-        if halt_s is None and rig.clock.now() - still > (STILL_S if moved else UNMOVED_S):
+        if not math.isnan(halted_s) and rig.clock.now() - still > (STILL_S if moved else UNMOVED_S):
             break
+    if not moved:
+        raise CalibrationError(
+            f"the zoom camera's picture does not move where the dome is sent on at {SLOW_DEG_S:g} degrees/s: see that "
+            "nothing else halts it, and that it can turn so slowly"
+        )
     base = frames[0][1].astype(np.float32)
     window = cv2.createHanningWindow(base.shape[::-1], cv2.CV_32F)
     shifts = np.array([cv2.phaseCorrelate(base, grey.astype(np.float32), window)[0] for _, grey in frames])
     end = np.median(shifts[-5:], axis=0)
     along = shifts @ end / max(float(np.linalg.norm(end)), 1e-9)
     reduced = focal_px * base.shape[1] / rig.zoom.size[0]
-    return _Turn(t, np.array([t for t, _ in frames]), np.arctan(along / reduced), halted_s)
+    # What both pictures show is as far from the middle in one as in the other.
+    angles = 2 * np.arctan(along / 2 / reduced)
+    on_its_way = np.abs(angles / _end(angles) - 0.5) < 0.5 + BESIDE
+    return _Turn(t, halted_s, np.array([t for t, _ in frames])[on_its_way], angles[on_its_way], states)
 
 
 def start_of_turns(turns: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
-    """Find when turns begin and how fast they are; they are even over the first half of the way, and alike.
+    """Find when turns begin and how fast they are; they are alike, and even over half of the shortest way.
 
     Args:
-        turns: times after the command [s], and parts of the way, (n,) each.
+        turns: times after the command [s], and angles [rad], (n,) each.
 
     Returns:
-        The start after the command [s], and the speed in ways a second.
+        The start after the command [s], and the speed [rad/s].
     """
-    times, parts = (np.concatenate(each) for each in zip(*turns, strict=True))
-    half = np.minimum(parts, 0.5)
+    way = min(_end(angles) for _, angles in turns)
+    times, angles = (np.concatenate(each) for each in zip(*turns, strict=True))
+    half = np.minimum(angles / way, 0.5)
 
     def left(unknown: Any) -> float:
         there = np.clip((times - unknown[0]) / math.exp(unknown[1]), 0.0, 0.5)
@@ -575,52 +587,45 @@ def start_of_turns(turns: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
     start, takes = min(tried, key=left)
     simplex = np.array([[start, takes], [start + 0.01, takes], [start, takes + 0.1]])
     fit = minimize(left, simplex[0], method="Nelder-Mead", options={"initial_simplex": simplex})
-    return float(fit.x[0]), math.exp(-fit.x[1])
+    return float(fit.x[0]), way * math.exp(-fit.x[1])
 
 
-def _time_starts(rig: Rig, room: Room, focal_px: float) -> tuple[float, float | None, float]:
-    """Turn to and fro; return `Characteristics.light_s` and `report_s`, and the speed [rad/s]."""
-    turns, states = list[_Turn](), list[PanTiltState]()
-    _go(rig, _beside(room, -RAMP_DEG / 2))
-    for phase_s, side in zip(PHASES_S, itertools.cycle((1, -1)), strict=False):
-        turns.append(_turn(rig, _beside(room, side * RAMP_DEG / 2), focal_px, states, phase_s))
-    late = rig.spec.zoom.latency_s
-    start, rate = start_of_turns([(turn.times + late - turn.t, turn.angles / turn.way) for turn in turns])
-    way = statistics.median(turn.way for turn in turns)
-    return start, _report_s(turns, states, late), rate * way
-
-
-def _report_s(turns: Sequence[_Turn], states: Sequence[PanTiltState], late: float) -> float | None:
-    """Compare the picture with the reports; None where the head reports nothing that moves so."""
-    if any(state.sigma for state in states):  # reckoned from the commands
-        return None
-    times, pans = np.array([(state.t, state.pan) for state in states]).T
-    _, fresh = np.unique(times, return_index=True)
-    ends = [turn.angles if i % 2 == 0 else turn.way - turn.angles for i, turn in enumerate(turns)]
-    found = delay_between(
-        np.concatenate([turn.times for turn in turns]), np.concatenate(ends), times[fresh], pans[fresh]
-    )
-    return late + found.seconds if found.agreement >= AGREEMENT else None
-
-
-def _time_stops(rig: Rig, room: Room, focal_px: float, rate: float, scale: float) -> float | None:
-    """Halt slow turns; return `Characteristics.stop_s`, None where they were over before.
+def time_turns(rig: Rig, room: Room, focal_px: float, scale: float) -> tuple[float, float | None, float | None]:
+    """Halt slow turns; return `Characteristics.light_s`, `report_s` and `stop_s`.
 
     Args:
         rig: the rig.
         room: where it may turn.
         focal_px: focal length [px].
-        rate: speed of slow turns [rad/s].
         scale: true angle over reported one of pan.
+
+    Raises:
+        CalibrationError: the picture does not move.
     """
-    found, side, longest = [], 1, scale * math.radians(WHOLE * STOPPED_DEG)
-    for halt_s in HALTS_S:
-        _go(rig, _beside(room, -side * STOPPED_DEG / 2))
-        turn = _turn(rig, _beside(room, side * STOPPED_DEG / 2), focal_px, [], halt_s=halt_s)
-        found.append(turn.way / rate - turn.halted_s if turn.way < longest else math.nan)
-        side = -side
-    stop_s = statistics.median(found)
-    return None if math.isnan(stop_s) else stop_s
+    turns, late = list[_Turn](), rig.spec.zoom.latency_s
+    for phase_s, halt_s, side in zip(PHASES_S, itertools.cycle(HALTS_S), itertools.cycle((1, -1)), strict=False):
+        _go(rig, _beside(room, -side * SLOW_DEG / 2))
+        turns.append(_turn(rig, _beside(room, side * SLOW_DEG / 2), focal_px, phase_s, halt_s))
+    start, rate = start_of_turns([(turn.times + late - turn.t, turn.angles) for turn in turns])
+    longest = scale * math.radians(WHOLE * SLOW_DEG)
+    stops = [turn.way / rate - turn.halted_s for turn in turns if turn.way < longest]
+    return start, _report_s(turns, late), statistics.median(stops) if len(stops) > len(turns) / 2 else None
+
+
+def _report_s(turns: Sequence[_Turn], late: float) -> float | None:
+    """Compare the picture with the reports; None where the head reports nothing that moves so."""
+    seen, said = list[tuple[Array, Array]](), list[tuple[Array, Array]]()
+    for i, turn in enumerate(turns):
+        if any(state.sigma for state in turn.states):  # reckoned from the commands
+            return None
+        after = APART_S * i - turn.t
+        times, fresh = np.unique([state.t for state in turn.states], return_index=True)
+        ways = np.abs(np.array([state.pan for state in turn.states])[fresh] - turn.states[0].pan)
+        stands = LONGEST_DELAY + BACK_S  # before the first report, and after the last
+        said.append((np.array([times[0] - stands, *times, times[-1] + stands]) + after, np.array([0, *ways, ways[-1]])))
+        seen.append((turn.times + after, turn.angles))
+    found = delay_between(*map(np.concatenate, zip(*seen, strict=True)), *map(np.concatenate, zip(*said, strict=True)))
+    return late + found.seconds if found.agreement >= AGREEMENT else None
 
 
 def _beside(room: Room, way_deg: float) -> Angles:

@@ -5,7 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from cotarget.characterization import characterize, fit_pictures, growth_of, orientation_of, room_of, start_of_turns
+from cotarget.characterization import (
+    characterize,
+    fit_pictures,
+    growth_of,
+    orientation_of,
+    room_of,
+    start_of_turns,
+    time_turns,
+)
 from tests.support.rigs import rig_of
 from tests.support.textured_dome import LATENCY_S, LONGEST, SIZE, WIDE_PX, TexturedDome
 
@@ -83,6 +91,16 @@ def test_a_dome_that_swings_about_its_goal_is_halted_and_measured():
     assert found.light_s == pytest.approx(dome.delay_s + LATENCY_S + BRAKING_S, abs=SAME_DELAY_S)
     assert found.stop_s == pytest.approx(dome.stop_s, abs=2 * SAME_STOP_S)
     assert dome.t < begin + 600.0
+
+
+def test_times_of_a_dome_that_slows_down_long_before_its_goal():
+    """As one that is steered by velocities and stops late; its goals in slow turns are 18 degrees away."""
+    dome = TexturedDome(steered=True, scale=(-1.2, 1.1), delay_s=0.1, stop_s=1.1)
+    rig = rig_of(dome)
+    light_s, report_s, stop_s = time_turns(rig, room_of(rig), WIDE_PX, 1.2)
+    assert light_s == pytest.approx(dome.delay_s + LATENCY_S + BRAKING_S, abs=SAME_DELAY_S)
+    assert report_s == pytest.approx(LATENCY_S, abs=SAME_DELAY_S)
+    assert stop_s == pytest.approx(dome.stop_s, abs=SAME_STOP_S)
 
 
 def test_a_dome_that_does_not_move_is_found_out():

@@ -39,10 +39,10 @@ LONGEST_S = 600.0  # a command that takes longer is given up [s]
 MOST_TIMES = 2  # that the command is run
 AGAIN = "again"  # in the words of the command, where a second time would find more
 STOPS_S = {"": 0.0, "slow-stop": 0.4, "slower-stop": 1.1}
-RAMP_DEG_S = 6.0  # speed of the turns whose start is timed
+SLOW_DEG_S = 6.0  # speed of the turns whose start is timed
 MOVES, FRAMES = 8, 40  # by which the true delays are measured
 AT_ONCE_DEG = 2.0
-STILL_S = 3.0  # after each of these moves
+LONGEST_MOVE_S = 20.0  # for the head to stand after each of these moves
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def run(folder: Path, seed: int) -> list[Row]:
         if status:
             return [row | {"failed": True}]
         table = _write(file, text, keys)
-        delay_s = _true_delay(file, config, start, pipe) + RAMP_DEG_S / config.sim.head.accel_deg_s2 / 2
+        delay_s = _true_delay(file, config, start, pipe) + SLOW_DEG_S / config.sim.head.accel_deg_s2 / 2
     return [row | {"failed": False} | errors(facts, config, table, said, delay_s)]
 
 
@@ -208,7 +208,8 @@ def _true_delay(file: Path, config: RigConfig, start: float, pipe: Connection) -
             called.append(rig.clock.now())
             way = math.radians(AT_ONCE_DEG) * (1 - i % 2)
             rig.head.move(state.pan + way, state.tilt + way / 4)
-            while rig.clock.now() < STILL_S + called[-1]:  # the watchdog halts a head whose frames nobody reads
+            # A head that is still on its way gets commands without a call. The watchdog wants its frames to be read.
+            while rig.head.state().moving and rig.clock.now() < LONGEST_MOVE_S + called[-1]:
                 frame = rig.zoom.read(newer_than=frame.t)
         pipe.send("end")
         moved = pipe.recv()

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from cotarget.drivers.axes import AxisFacts
+from cotarget.drivers.velocity import SteeredAxis
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.sim.motion import Axis
 from tests.support.rigs import alike
@@ -17,6 +19,10 @@ TEXTURE = (4096, 2048)  # of the whole sphere
 LATENCY_S = 0.15  # from light to arrival; the rig's spec says less
 RATE_HZ = 12.5
 SWING_S = 1.2  # period
+STEERED_S = 0.04  # between its positions, by which it is steered
+DEGREES = AxisFacts(
+    unit=math.radians(1), lowest=-170, highest=170, fastest=100, step=0.0, slack=0.1, loses_steps=False
+)  # fmt: skip
 
 
 @functools.cache
@@ -49,6 +55,7 @@ class TexturedDome:
         obeys: whether it goes where it is sent.
         cap_deg_s: highest speed beyond half of the zoom's range.
         swing_deg: by which it swings about its goal until it is halted.
+        steered: whether it takes velocities, with which a driver leads it to its goal that knows `stop_s`.
     """
 
     seed: int = 0
@@ -65,11 +72,14 @@ class TexturedDome:
     cap_deg_s: float = 100.0
     swing_deg: float = 0.0
     swings: bool = False
+    steered: bool = False
     t: float = 10.0
 
     def __post_init__(self):
         self._texture = texture(self.seed)
         self.axes = [Axis(math.radians(100), math.radians(800)) for _ in range(2)]
+        self.steering = [SteeredAxis(DEGREES, self.delay_s, self.stop_s) for _ in range(2)]
+        self.steered_t = self.t
         self.zooms = [(0.0, WIDE_PX)]
         self.sent = (0.0, 0.0)
         self.fixed, self.zoom, self.head, self.clock = _Fixed(self), _Zoom(self), _Head(self), RigClock(self, 1e-3)
@@ -79,7 +89,24 @@ class TexturedDome:
         share = math.log(next(f for at, f in reversed(self.zooms) if at <= t) / WIDE_PX) / math.log(LONGEST)
         return WIDE_PX * LONGEST ** (share + self.curve * share * (1 - share))
 
+    def steer(self, t):
+        """Send velocities until a time."""
+        while self.steered and self.steered_t <= t:
+            now, self.steered_t = self.steered_t, self.steered_t + STEERED_S
+            for axis, steering, k in zip(self.axes, self.steering, self.scale, strict=True):
+                before = steering.velocity
+                velocity = steering.wanted(math.degrees(axis.motor(now)[0]) / k, now, now)
+                if velocity == before:
+                    continue
+                steering.send(velocity, now)
+                if velocity:
+                    end = math.copysign(math.pi, velocity * k)
+                    axis.command(now + self.delay_s, end, abs(k) * math.radians(abs(velocity)))
+                else:
+                    axis.halt(now + self.delay_s + self.stop_s)
+
     def angles(self, t):
+        self.steer(t)
         swing = math.radians(self.swing_deg) * math.sin(2 * math.pi * t / SWING_S) if self.swings else 0.0
         return [axis.motor(t)[0] + swing for axis in self.axes]
 
@@ -150,6 +177,11 @@ class _Head:
     def move(self, pan, tilt, speed=None, wait=False):
         rig, step = self.rig, math.radians(self.rig.round_deg)
         rig.sent, rig.swings = (pan, tilt), True
+        rig.steer(rig.t)
+        if rig.steered:
+            for steering, goal, rate in zip(rig.steering, (pan, tilt), self.limits.capped(speed), strict=True):
+                steering.aim(math.degrees(goal), math.degrees(rate), rig.t)
+            return pan, tilt
         for axis, goal, k, rate in zip(rig.axes, (pan, tilt), rig.scale, self.limits.capped(speed), strict=True):
             goal = round(goal / step) * step if step else goal
             if rig.obeys:
@@ -160,5 +192,8 @@ class _Head:
 
     def halt(self):
         self.rig.swings = False
+        self.rig.steer(self.rig.t)
+        for steering in self.rig.steering:
+            steering.stop(self.rig.t)
         for axis in self.rig.axes:
             axis.halt(self.rig.t + self.rig.delay_s + self.rig.stop_s)
