@@ -59,6 +59,7 @@ class Dome:
         protocol: that moves it.
         latency_s: from light to the arrival of its picture at the stream's server [s]; None for that of the simulation.
         board: whether the rig is calibrated by the board over the wire; by the truth otherwise.
+        ends: words of the error that names a dome that cannot be followed with; its yield does not count.
     """
 
     profiles: tuple[str, ...] = ()
@@ -67,6 +68,7 @@ class Dome:
     protocol: str = "onvif"
     latency_s: float | None = None
     board: bool = False
+    ends: str = ""
 
 
 STEERED = ("continuous-only",)
@@ -97,7 +99,7 @@ DOMES: Mapping[str, Dome] = {
     "pan-alone-ignored": Dome(("pan-alone-ignored",)),
     "relative-only": Dome(("relative-only",)),
     "media2-only": Dome(("media2-only",)),
-    "absolute-ignored": Dome(("absolute-ignored",), {"absolute": False}),
+    "absolute-ignored": Dome(("absolute-ignored",), {"absolute": False}, ends="did not arrive in time"),  # the lens
     "capped-by-zoom": Dome(("capped-by-zoom",), {"zoomed_speeds": [[1.6, 30.0], [2.7, 7.85], [4.4, 4.5], [7.3, 1.5]]}),
     "continuous-only": Dome(STEERED),
     "continuous-only, stops after 0.4 s": Dome((*SLOW, "slow-stop"), {"stop_delay_s": 0.4}, wanted=0.8),

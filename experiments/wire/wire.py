@@ -157,9 +157,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         apart = max(max(row["pan_steps"], row["tilt_steps"]) for row in places)
         figures["parity, farthest apart"] = at_most(round(apart / ROUNDING) * ROUNDING, PARITY_STEPS, "steps")
     for row in of.get("follow", []):
-        said = f" ({row['error']})" if row["error"] else ""
-        name = f"follow, {row['dome']}: yield {row['wire']:.3f} for {row['sim']:.3f} in the simulation{said}"
-        figures[name] = at_least(row["wire"] / row["sim"], follow.DOMES[row["dome"]].wanted, "of it")
+        figures |= _of_followed(row, follow.DOMES[row["dome"]])
     figures |= _of_characterized(of.get("characterize", []))
     loads = [row["load"] for row in rows]
     return {
@@ -173,6 +171,15 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "again": {name: again for name, mine in of.items() if (again := mine[0].get(AGAIN))},
         "load": [min(loads, default=math.nan), max(loads, default=math.nan)],
     }
+
+
+def _of_followed(row: Row, dome: follow.Dome) -> dict[str, Figure]:
+    """Give the yield over that of the simulation, or whether a dome that cannot be followed with was named."""
+    said = f" ({row['error']})" if row["error"] else ""
+    if dome.ends:
+        return {f"follow, {row['dome']}: not named{said}": at_most(int(dome.ends not in row["error"]), 0, "runs")}
+    name = f"follow, {row['dome']}: yield {row['wire']:.3f} for {row['sim']:.3f} in the simulation{said}"
+    return {name: at_least(row["wire"] / row["sim"], dome.wanted, "of it")}
 
 
 def _of_characterized(rows: Sequence[Row]) -> dict[str, Figure]:

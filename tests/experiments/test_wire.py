@@ -90,6 +90,14 @@ def test_the_largest_errors_of_drawn_domes_count():
     assert sum(not figure["reached"] for figure in figures.values()) == 3
 
 
+def test_a_dome_that_cannot_be_followed_with_has_to_be_named():
+    row = {"figure": "follow", "dome": "absolute-ignored", "wire": 0.0, "sim": 1.0, "error": "", "load": 1.0}
+    named = row | {"error": "the lens at the device at 127.0.0.1:80 did not arrive in time: it is at 0 where 1"}
+    for rows, reached in (([named], True), ([row | {"wire": 1.0}], False), ([row | {"error": "it has gone"}], False)):
+        (figure,) = summarise(rows)["figures"].values()
+        assert figure["reached"] == reached
+
+
 def test_what_was_found_of_a_dome_is_compared_with_the_truth():
     """By hand: pan counts the other way and its range is 10 % too small; the lens is that of the emulator."""
     config = parse_config({"sim": {}})
