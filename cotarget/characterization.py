@@ -45,6 +45,8 @@ LENS_STANDS_S = 0.8  # longest delay of a picture, after the lens has come to re
 STILL_PX, STILL_S = 0.25, 0.5  # the picture stands if its corners move by no more from frame to frame for so long
 UNMOVED_S = 3.0  # a picture that has not moved for so long after a command does not move [s]
 BACK_S = 5.0  # longest time without a frame [s]
+# To places, before it is known whether positions are late: at the highest speed, half a second is half of the view.
+PLACE_DEG_S = 20.0
 RESTLESS_S = 15.0  # longest time on the way to a place [s]
 SLOWEST_S = 60.0  # longest time to wait for a picture that stands [s]
 CORNERS, WEAKEST, APART_PX = 200, 0.01, 8
@@ -295,7 +297,7 @@ def _look_around(rig: Rig, room: Room) -> list[_View]:
     views, moved = [], 0
     for i, place in enumerate(PLACES):
         goal = _goal(room, place)
-        sent = _patiently(functools.partial(rig.head.move, *goal))
+        sent = _patiently(functools.partial(rig.head.move, *goal, speed=math.radians(PLACE_DEG_S)))
         image, has_moved = _settled(rig)
         views.append(_View(image, _patiently(rig.head.state), sent))
         moved += has_moved
@@ -636,7 +638,7 @@ def _beside(room: Room, way_deg: float) -> Angles:
 
 def _go(rig: Rig, goal: Angles) -> tuple[Image, bool]:
     """Go to a place; return the picture there, grey, and whether it has moved."""
-    _patiently(lambda: rig.head.move(*goal))
+    _patiently(lambda: rig.head.move(*goal, speed=math.radians(PLACE_DEG_S)))
     return _settled(rig)
 
 

@@ -14,8 +14,8 @@ SPEED_SHARE = 0.1  # relative standard deviation of a speed that was not measure
 SLOWEST = 1e-6  # a speed of zero would never arrive
 GAIN_HZ = 4.0  # of steering; above a third of the inverse of the unpredicted dead time it would overshoot
 FLOW_S = 0.5  # goals that follow each other as soon move along
-# Factor of the tolerance of an axis that goes beyond its goal, and back with each new goal; its limit, in slacks.
-WIDER, WIDEST = 1.5, 10.0
+# Factors of gain and tolerance of an axis that goes beyond its goal again and again; its widest tolerance, in slacks.
+CALMER, WIDER, WIDEST = 0.5, 1.5, 10.0
 SWINGS = 2  # beyond a goal that count as chance, such as by a late status
 SLOW = 0.01  # of the highest speed: a goal that moves by less may rest, whatever the slack
 FLOW_GAIN = 0.4  # by which the newest pair of goals changes their estimated speed
@@ -73,7 +73,7 @@ class SteeredAxis:
     The position is predicted from the newest one that the device has said and the velocities sent since. An axis that
     turns on after a stop is stopped as much earlier where its goal rests; on the way with a goal that moves, another
     velocity takes the place of a stop. One that goes beyond a goal at rest all the same, again and again,
-    such as by its lowest speed, gets a wider tolerance for a while.
+    such as by positions that are late or by its lowest speed, gets a lower gain and a wider tolerance for a while.
 
     Args:
         facts: of the axis.
@@ -85,7 +85,7 @@ class SteeredAxis:
 
     def __init__(self, facts: AxisFacts, delay: float, stop_delay: float = 0.0, answer: float = 0.0) -> None:
         self._facts, self._delay, self._stop_delay = facts, max(delay, answer), stop_delay
-        self._gain = 1 / (1 / GAIN_HZ + 2 * answer)
+        self._gain = self._most_gain = 1 / (1 / GAIN_HZ + 2 * answer)
         self._sent = deque([(0.0, 0.0)], maxlen=100)  # (time, velocity)
         self._goal: float | None = None
         self._limit, self._flow, self._aimed = facts.fastest, 0.0, -FLOW_S
@@ -109,6 +109,7 @@ class SteeredAxis:
         if goal != self._goal:
             self._turned, self._swings = 0.0, 0
             self._tolerance = max(self._tolerance / WIDER, self._least)
+            self._gain = min(self._gain * WIDER, self._most_gain)
         self._goal, self._limit, self._aimed = goal, speed, now
 
     def stop(self, now: float) -> None:
@@ -145,6 +146,7 @@ class SteeredAxis:
         if not flow and wanted * self._turned < 0 and beyond > self._facts.slack:
             self._swings += 1
             if self._swings > SWINGS:
+                self._gain *= CALMER
                 self._tolerance = min(max(WIDER * self._tolerance, beyond / 2), WIDEST * self._facts.slack)
         self._turned = wanted
         return wanted

@@ -46,13 +46,14 @@ def test_an_axis_that_was_halted_stays_where_it_says_it_is():
     assert axis.arrives <= 1.0
 
 
-def steered(goals, seconds, late=0.05, start=0.0, stops_late=0.0, known=0.0, slowest=0.0):
+def steered(goals, seconds, late=0.05, dated=None, start=0.0, stops_late=0.0, known=0.0, slowest=0.0):
     """Positions of an axis that turns at the velocities it gets, ``DELAY_S`` later, and is asked 20 times a second.
 
     Args:
         goals: goal at a time, or None.
         seconds: duration.
         late: age of reported positions.
+        dated: that age, as the axis is told; the true one by default.
         start: position.
         stops_late: time for which it goes on after a stop, if no other velocity comes meanwhile.
         known: that time, as the axis is told.
@@ -74,9 +75,8 @@ def steered(goals, seconds, late=0.05, start=0.0, stops_late=0.0, known=0.0, slo
         if i % 10 == 0 and (goal := goals(now)) is not None:
             axis.aim(goal, 50.0, now)
         if i % 5 == 0:
-            t = now - late
-            seen = next(p for when, p in reversed(history) if when <= t)
-            velocity = axis.wanted(seen, t, now)
+            seen = next(p for when, p in reversed(history) if when <= now - late)
+            velocity = axis.wanted(seen, now - (late if dated is None else dated), now)
             axis.send(velocity, now)
             sent.append((now, velocity))
         places.append(position)
@@ -112,6 +112,14 @@ def test_an_axis_that_turns_on_after_a_stop_comes_to_rest_at_its_goal(stops_late
 def test_an_axis_of_which_nobody_knows_that_it_turns_on_comes_to_rest_too():
     places = steered(lambda now: 30.0, 20.0, stops_late=0.4, slowest=1.5)
     assert max(places[-200:]) == min(places[-200:]) == pytest.approx(30.0, abs=0.6)
+
+
+@pytest.mark.parametrize("stops_late", [0.0, 0.4])
+def test_an_axis_of_which_nobody_knows_that_its_positions_are_late_comes_to_rest_near_its_goal(stops_late):
+    """By half a second; it is sent on once it stands. It went to and fro by 20 without end."""
+    places = steered(lambda now: 30.0 if now < 20 else 60.0, 40.0, late=0.5, dated=0.0, stops_late=stops_late)
+    for goal, at in ((30.0, places[1800:2000]), (60.0, places[-200:])):
+        assert max(at) == min(at) == pytest.approx(goal, abs=1.0)
 
 
 @pytest.mark.parametrize(("answer", "obeyed", "read"), [
