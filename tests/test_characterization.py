@@ -95,12 +95,25 @@ def test_a_dome_that_swings_about_its_goal_is_halted_and_measured():
 
 def test_times_of_a_dome_that_slows_down_long_before_its_goal():
     """As one that is steered by velocities and stops late; its goals in slow turns are 18 degrees away."""
-    dome = TexturedDome(steered=True, scale=(-1.2, 1.1), delay_s=0.1, stop_s=1.1)
+    dome = TexturedDome(steered=True, scale=(-1.2, 1.1), delay_s=0.1, stop_s=1.1, known_s=1.1)
     rig = rig_of(dome)
     light_s, report_s, stop_s = time_turns(rig, room_of(rig), WIDE_PX, 1.2)
     assert light_s == pytest.approx(dome.delay_s + LATENCY_S + BRAKING_S, abs=SAME_DELAY_S)
     assert report_s == pytest.approx(LATENCY_S, abs=SAME_DELAY_S)
     assert stop_s == pytest.approx(dome.stop_s, abs=SAME_STOP_S)
+
+
+@pytest.mark.slow
+def test_a_steered_dome_of_which_nothing_is_known_is_measured():
+    """It stops late by 1.1 s, and its positions are half a second late."""
+    dome = TexturedDome(steered=True, scale=(-1.2, 1.1), delay_s=0.1, stop_s=1.1, late_s=0.5)
+    begin = dome.t
+    found = characterized(dome)
+    assert found.scale == pytest.approx(dome.scale, rel=SAME_SCALE)
+    assert found.light_s == pytest.approx(dome.delay_s + LATENCY_S + BRAKING_S, abs=SAME_DELAY_S)
+    assert found.report_s == pytest.approx(LATENCY_S - dome.late_s, abs=SAME_DELAY_S)
+    assert found.stop_s == pytest.approx(dome.stop_s, abs=SAME_STOP_S)
+    assert dome.t < begin + 400.0
 
 
 def test_a_dome_that_does_not_move_is_found_out():

@@ -55,7 +55,8 @@ class TexturedDome:
         obeys: whether it goes where it is sent.
         cap_deg_s: highest speed beyond half of the zoom's range.
         swing_deg: by which it swings about its goal until it is halted.
-        steered: whether it takes velocities, with which a driver leads it to its goal that knows `stop_s`.
+        steered: whether it takes velocities, with which a driver leads it to its goal that does not know `late_s`.
+        known_s: `stop_s`, as that driver knows it.
     """
 
     seed: int = 0
@@ -73,12 +74,13 @@ class TexturedDome:
     swing_deg: float = 0.0
     swings: bool = False
     steered: bool = False
+    known_s: float = 0.0
     t: float = 10.0
 
     def __post_init__(self):
         self._texture = texture(self.seed)
         self.axes = [Axis(math.radians(100), math.radians(800)) for _ in range(2)]
-        self.steering = [SteeredAxis(DEGREES, self.delay_s, self.stop_s) for _ in range(2)]
+        self.steering = [SteeredAxis(DEGREES, self.delay_s, self.known_s) for _ in range(2)]
         self.steered_t = self.t
         self.zooms = [(0.0, WIDE_PX)]
         self.sent = (0.0, 0.0)
@@ -95,7 +97,7 @@ class TexturedDome:
             now, self.steered_t = self.steered_t, self.steered_t + STEERED_S
             for axis, steering, k in zip(self.axes, self.steering, self.scale, strict=True):
                 before = steering.velocity
-                velocity = steering.wanted(math.degrees(axis.motor(now)[0]) / k, now, now)
+                velocity = steering.wanted(math.degrees(axis.motor(now - self.late_s)[0]) / k, now, now)
                 if velocity == before:
                     continue
                 steering.send(velocity, now)
