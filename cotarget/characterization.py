@@ -45,7 +45,7 @@ LENS_STANDS_S = 0.8  # longest delay of a picture, after the lens has come to re
 STILL_PX, STILL_S = 0.25, 0.5  # the picture stands if its corners move by no more from frame to frame for so long
 UNMOVED_S = 3.0  # a picture that has not moved for so long after a command does not move [s]
 BACK_S = 5.0  # longest time without a frame [s]
-# To places, before it is known whether positions are late: at the highest speed, half a second is half of the view.
+# Speed to places: nobody knows yet whether positions are late; at the highest, half a second is half of the view.
 PLACE_DEG_S = 20.0
 RESTLESS_S = 15.0  # longest time on the way to a place [s]
 SLOWEST_S = 60.0  # longest time to wait for a picture that stands [s]
@@ -556,16 +556,25 @@ def _turn(rig: Rig, goal: Angles, focal_px: float, phase_s: float, halt_s: float
             f"the zoom camera's picture does not move where the dome is sent on at {SLOW_DEG_S:g} degrees/s: see that "
             "nothing else halts it, and that it can turn so slowly"
         )
-    base = frames[0][1].astype(np.float32)
+    images = [grey for _, grey in frames]
+    angles = _turned(images, focal_px * images[0].shape[1] / rig.zoom.size[0])
+    on_its_way = np.isfinite(angles)
+    return _Turn(t, halted_s, np.array([t for t, _ in frames])[on_its_way], angles[on_its_way], states)
+
+
+def _turned(images: Sequence[Image], focal_px: float) -> Array:
+    """Measure by which angles pictures of one turn are turned against the first [rad], (n,).
+
+    Nan for one that was taken for another place like it.
+    """
+    base = images[0].astype(np.float32)
     window = cv2.createHanningWindow(base.shape[::-1], cv2.CV_32F)
-    shifts = np.array([cv2.phaseCorrelate(base, grey.astype(np.float32), window)[0] for _, grey in frames])
+    shifts = np.array([cv2.phaseCorrelate(base, image.astype(np.float32), window)[0] for image in images])
     end = np.median(shifts[-5:], axis=0)
     along = shifts @ end / max(float(np.linalg.norm(end)), 1e-9)
-    reduced = focal_px * base.shape[1] / rig.zoom.size[0]
     # What both pictures show is as far from the middle in one as in the other.
-    angles = 2 * np.arctan(along / 2 / reduced)
-    on_its_way = np.abs(angles / _end(angles) - 0.5) < 0.5 + BESIDE
-    return _Turn(t, halted_s, np.array([t for t, _ in frames])[on_its_way], angles[on_its_way], states)
+    angles = 2 * np.arctan(along / 2 / focal_px)
+    return np.where(np.abs(angles / _end(angles) - 0.5) < 0.5 + BESIDE, angles, np.nan)
 
 
 def start_of_turns(turns: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
