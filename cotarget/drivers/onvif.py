@@ -863,7 +863,9 @@ class OnvifLink(PtzLink):
         pan, tilt, _ = self._positions(self._seen)
         assert pan is not None
         assert tilt is not None
-        wanted = [axis.wanted(at, self._seen.t, now) for axis, at in zip(self._steered, (pan, tilt), strict=True)]
+        panned, tilted = self._steered
+        wanted = [panned.wanted(pan, self._seen.t, now, alone=not tilted.velocity)]
+        wanted.append(tilted.wanted(tilt, self._seen.t, now, alone=not wanted[0]))
         if is_blind:
             wanted = [0.0, 0.0]
         fastest = self._fastest_deg_s
@@ -887,7 +889,7 @@ class OnvifLink(PtzLink):
             self._timeout_s = None  # some refuse a timeout though they say its range
         self._renewed = now
         for axis, speed in zip(self._steered, wanted, strict=True):
-            axis.send(speed, now)
+            axis.send(speed, now, alone=not any(wanted))
 
     def _velocity(self, pan: float, tilt: float) -> str:
         """Write velocities as shares of the highest; without a zoom, since one of 0 would stop the lens."""

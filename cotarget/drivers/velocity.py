@@ -72,7 +72,8 @@ class SteeredAxis:
 
     The position is predicted from the newest one that the device has said and the velocities sent since. An axis that
     turns on after a stop is stopped as much earlier where its goal rests; on the way with a goal that moves, another
-    velocity takes the place of a stop. One that goes beyond a goal at rest all the same, again and again,
+    velocity takes the place of a stop. So does a velocity of 0 while the other axis turns: the device stops where both
+    are 0. One that goes beyond a goal at rest all the same, again and again,
     such as by positions that are late or by its lowest speed, gets a lower gain and a wider tolerance for a while.
 
     Args:
@@ -86,7 +87,7 @@ class SteeredAxis:
     def __init__(self, facts: AxisFacts, delay: float, stop_delay: float = 0.0, answer: float = 0.0) -> None:
         self._facts, self._delay, self._stop_delay = facts, max(delay, answer), stop_delay
         self._gain = self._most_gain = 1 / (1 / GAIN_HZ + 2 * answer)
-        self._sent = deque([(0.0, 0.0)], maxlen=100)  # (time, velocity)
+        self._sent = deque([(0.0, 0.0)], maxlen=100)  # (time at which it begins, velocity)
         self._goal: float | None = None
         self._limit, self._flow, self._aimed = facts.fastest, 0.0, -FLOW_S
         self._slow = min(self._gain * facts.slack, SLOW * facts.fastest)
@@ -115,15 +116,16 @@ class SteeredAxis:
     def stop(self, now: float) -> None:
         """Forget the goal; the axis was stopped."""
         self._goal, self._turned = None, 0.0
-        self._sent.append((now, 0.0))
+        self.send(0.0, now)
 
-    def wanted(self, position: float, t: float, now: float) -> float:
+    def wanted(self, position: float, t: float, now: float, alone: bool = True) -> float:
         """Return the velocity to send now [1/s].
 
         Args:
             position: that the device has said.
             t: time of it.
             now: the time.
+            alone: whether the other axis stands.
         """
         if self._goal is None:
             return 0.0
@@ -131,7 +133,7 @@ class SteeredAxis:
         goal = self._goal + flow * (now - self._aimed)
         if not self._facts.lowest < goal < self._facts.highest:
             goal, flow = min(max(goal, self._facts.lowest), self._facts.highest), 0.0
-        here, coast = self._predicted(position, t, now)
+        here, coast = self._predicted(position, t, now, alone)
         gain = self._gain
         if not flow:
             left = goal - here - coast
@@ -151,20 +153,22 @@ class SteeredAxis:
         self._turned = wanted
         return wanted
 
-    def send(self, velocity: float, now: float) -> None:
-        """Note a velocity that was sent."""
-        self._sent.append((now, velocity))
+    def send(self, velocity: float, now: float, alone: bool = True) -> None:
+        """Note a velocity that was sent; ``alone`` if that of the other axis is 0."""
+        self._sent.append((self._begin(velocity, now, alone), velocity))
 
-    def _predicted(self, position: float, t: float, now: float) -> tuple[float, float]:
+    def _begin(self, velocity: float, now: float, alone: bool) -> float:
+        return now + self._delay + (self._stop_delay if alone and not velocity else 0.0)
+
+    def _predicted(self, position: float, t: float, now: float, alone: bool) -> tuple[float, float]:
         """Predict the position at which a command of now takes effect, and the way from there on if that is a stop."""
         motions: list[tuple[float, float]] = []  # (begin, velocity)
-        for sent, velocity in self._sent:
-            begin = sent + self._delay + (0.0 if velocity else self._stop_delay)
+        for begin, velocity in self._sent:
             while motions and motions[-1][0] >= begin:  # a stop that has not begun
                 motions.pop()
             motions.append((begin, velocity))
         takes_effect = now + self._delay
-        stops = motions[-1][0] if self.velocity == 0 else takes_effect + self._stop_delay
+        stops = motions[-1][0] if self.velocity == 0 else self._begin(0.0, now, alone)
         coast = 0.0
         for (begin, velocity), (end, _) in pairwise([*motions, (max(stops, takes_effect), 0.0)]):
             position += velocity * max(min(end, takes_effect) - max(begin, t), 0.0)

@@ -114,6 +114,33 @@ def test_an_axis_of_which_nobody_knows_that_it_turns_on_comes_to_rest_too():
     assert max(places[-200:]) == min(places[-200:]) == pytest.approx(30.0, abs=0.6)
 
 
+@pytest.mark.parametrize("stops_late", [0.4, 1.1])
+def test_an_axis_goes_to_its_goal_in_one_go_beside_another_one_that_stops_late_too(stops_late):
+    """The device turns on where both velocities are 0, and halts one axis at once where the other turns."""
+    axes, goals = [SteeredAxis(FACTS, DELAY_S, stops_late) for _ in range(2)], (20.0, 5.0)
+    places, velocities, starts = [0.0, 0.0], [0.0, 0.0], [0, 0]
+    orders = []  # (time, velocities)
+    for axis, goal in zip(axes, goals, strict=True):
+        axis.aim(goal, 50.0, 0.0)
+    for i in range(1500):
+        now = i / 100
+        if i % 5 == 0:
+            pan = axes[0].wanted(places[0], now, now, alone=not axes[1].velocity)
+            tilt = axes[1].wanted(places[1], now, now, alone=not pan)
+            if (pan, tilt) != (axes[0].velocity, axes[1].velocity):
+                for axis, velocity in zip(axes, (pan, tilt), strict=True):
+                    axis.send(velocity, now, alone=not (pan or tilt))
+                if pan or tilt:
+                    orders = [order for order in orders if any(order[1])]  # a stop that has not begun
+                orders.append((now + DELAY_S + (0.0 if pan or tilt else stops_late), (pan, tilt)))
+        while orders and orders[0][0] <= now:
+            before, velocities = velocities, orders.pop(0)[1]
+            starts = [n + (a == 0 != b) for n, a, b in zip(starts, before, velocities, strict=True)]
+        places = [at + velocity / 100 for at, velocity in zip(places, velocities, strict=True)]
+    assert starts == [1, 1]
+    assert places == pytest.approx(goals, abs=FACTS.slack)
+
+
 @pytest.mark.parametrize("stops_late", [0.0, 0.4])
 def test_an_axis_of_which_nobody_knows_that_its_positions_are_late_comes_to_rest_near_its_goal(stops_late):
     """By half a second; it is sent on once it stands. It went to and fro by 20 without end."""
