@@ -359,10 +359,11 @@ class OnvifCamera:
     def halt(self) -> None:
         """Begin to brake, after the time that the device takes for it; a stop under way is not begun anew."""
         late = max((s for name, s in STOPS_LATE_S.items() if name in self._faults), default=0.0)
-        if not late:
-            self._brake()
-        elif not self._stop.is_planned:
-            self._stop.after(late, self._brake)
+        with self._lock:  # clients stop it twice at the same time
+            if not late:
+                self._brake()
+            elif not self._stop.is_planned:
+                self._stop.after(late, self._brake)
 
     def _brake(self) -> None:
         with self._lock:
