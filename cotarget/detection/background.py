@@ -35,6 +35,9 @@ BACKGROUND_PART, THRESHOLD = 0.7, 20.0
 # Foreground thinner than the first is removed, but not that within the second of what is left: feet and rotors. Gaps
 # (across, down) that are closed within a target: what stands side by side is not bridged [px].
 OPENING_PX, RIM_PX, BRIDGE_PX = 3, 2, (1, 9)
+# Legs and neck of a person up to the first of these heights are thinner; they hang together with the rest over gaps
+# below the second [px].
+TALL_PX, GAP_PX = 40, 3
 # Least larger side of a target, in parts of the image's width.
 LEAST_PART = 24 / 640
 # Score of a large target: alone it confirms no track, but together with the track's travel.
@@ -101,13 +104,13 @@ class LargeTargetFinder:
         shift_px = np.zeros(2) if shift_px is None else shift_px
         shift = shift_px / factor
         image = moved(np.asarray(cv2.convertScaleAbs(images[-1], alpha=1 / exposure), dtype=np.uint8), -shift)
-        mask = self._subtract(image, frame.t, _reduced_boxes(places, shift_px, factor))
-        opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((OPENING_PX,) * 2, np.uint8))
-        near = cv2.dilate(opened, np.ones((2 * RIM_PX + 1,) * 2, np.uint8))
-        mask = np.asarray(cv2.bitwise_and(mask, near), dtype=np.uint8)
+        foreground = self._subtract(image, frame.t, _reduced_boxes(places, shift_px, factor))
         if shift.any():  # what has come into view is not known
-            seen = _moved_mask(np.full(mask.shape, FOREGROUND, np.uint8), -shift)
-            mask = np.asarray(cv2.bitwise_and(mask, cv2.compare(seen, FOREGROUND, cv2.CMP_EQ)), dtype=np.uint8)
+            seen = _moved_mask(np.full(foreground.shape, FOREGROUND, np.uint8), -shift)
+            foreground = np.asarray(cv2.bitwise_and(foreground, cv2.compare(seen, FOREGROUND, cv2.CMP_EQ)))
+        opened = cv2.morphologyEx(foreground, cv2.MORPH_OPEN, np.ones((OPENING_PX,) * 2, np.uint8))
+        near = cv2.dilate(opened, np.ones((2 * RIM_PX + 1,) * 2, np.uint8))
+        mask = np.asarray(cv2.bitwise_and(foreground, near), dtype=np.uint8)
         make_mask = partial(_full_size, _moved_mask(mask, shift), frame.image.shape)
         if self._learnt < LASTING_S:
             return Detections([], make_mask)
@@ -117,6 +120,9 @@ class LargeTargetFinder:
                 self.forget()
             return Detections([], make_mask)
         self._since = None
+        found = [each for each in self._boxes(mask) if self._has_edge(image, mask, _rows_and_columns(each))]
+        if self._upright:
+            found = [_with_limbs(each, mask, foreground) for each in found]
         boxes = [
             replace(
                 each,
@@ -125,8 +131,7 @@ class LargeTargetFinder:
                 # By the image's border, or by that of the background that is known.
                 clipped=each.clipped or is_clipped(each.center_px + shift, each.size_px, mask.shape),
             )
-            for each in self._boxes(mask)
-            if self._has_edge(image, mask, _rows_and_columns(each))
+            for each in found
         ]
         return Detections(boxes, make_mask)
 
@@ -238,6 +243,28 @@ class LargeTargetFinder:
         stands = cv2.morphologyEx(piece, cv2.MORPH_OPEN, np.ones((max(1, round(FLAT * height)), 1), np.uint8))
         edges = np.flatnonzero(np.diff(stands.any(axis=0), prepend=False, append=False)).tolist()
         return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def _with_limbs(box: Detection, mask: Image, foreground: Image) -> Detection:
+    """Extend the box of an upright target, in its columns, by thin foreground that hangs together with it.
+
+    Args:
+        box: box of whole pixels.
+        mask: foreground without what is thin, (H, W).
+        foreground: all foreground, (H, W).
+    """
+    rows, columns = _rows_and_columns(box)
+    reach = TALL_PX - (rows.stop - rows.start)  # up and down
+    if reach <= 0:
+        return box
+    top = max(rows.start - reach, 0)
+    limbs = foreground[top : rows.stop + reach, columns]
+    grown = np.zeros_like(limbs)
+    grown[rows.start - top : rows.stop - top] = mask[rows, columns]
+    for _ in range(round(reach / GAP_PX)):
+        grown = np.asarray(cv2.bitwise_and(cv2.dilate(grown, np.ones((2 * GAP_PX + 1, 3), np.uint8)), limbs))
+    _, first, _, height = cv2.boundingRect(grown)
+    return box_detection(columns.start, top + first, limbs.shape[1], height, box.score, mask.shape)
 
 
 def _rows_and_columns(box: Detection) -> tuple[slice, slice]:

@@ -489,6 +489,23 @@ def test_what_the_image_shows_is_learnt_beside_places_that_are_held_outside_of_i
     assert not found[-1].mask.any()
 
 
+def test_an_upright_target_is_boxed_with_its_legs():
+    """Legs of 4 px, which are two in the image of half the size, under a body of 18x36 px."""
+    rng, rate = np.random.default_rng(24), 25.0
+    finder, background, surface = LargeTargetFinder(rate, upright=True), scenery((640, 480), rng), texture(18, 72, rng)
+    heights = []
+    for i in range(40):
+        picture, u = background.copy(), 60 + 6 * i
+        if i >= 15:
+            picture[300:336, u : u + 18] = surface[:36]
+            for leg in (u + 2, u + 12):
+                picture[336:372, leg : leg + 4] = surface[36:, :4]
+        found = finder.find(Frame(noisy(picture, rng, NOISE), i / rate)).boxes
+        heights += [float(each.size_px[1]) for each in found if abs(each.center_px[0] - u - 8.5) < 10]
+    assert len(heights) > 20
+    assert np.median(heights) == pytest.approx(72, abs=4)  # two pixels of the image of half the size
+
+
 @pytest.mark.parametrize(("shape", "width"), [(0.4, (25, 42)), (None, (60, 130))])
 def test_an_upright_target_is_boxed_without_the_dark_shadow_at_its_feet(shape, width):
     rng, rate = np.random.default_rng(22), 25.0
