@@ -20,7 +20,7 @@ from cotarget.config import TargetProfile
 from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
 from cotarget.estimation.clock_offset import LEAST_S, ClockOffset
 from cotarget.estimation.measurement_model import Pose
-from cotarget.estimation.motion_model import GATE, HEAD_SIGMA, LOG_DEPTH, VELOCITY
+from cotarget.estimation.motion_model import GATE, HEAD_SIGMA
 from cotarget.estimation.target_filter import inflated
 from cotarget.estimation.zoom_matching import CloseupFinder, Finder, MatchingSettings, ZoomMeasurement, outline_in
 from cotarget.geometry import Array
@@ -448,8 +448,8 @@ class TargetFusion:
     def _leave_out_cover(self, target: Target, t: float) -> None:
         """Leave out what was observed while the target went behind something, once it is behind it.
 
-        The part that was left of it moved more slowly than the target. It is covered in the time in which it goes as
-        far as it is wide.
+        The part that was left of it moved more slowly than the target. That began before the boxes were small enough to
+        count as parts of it: as long again before.
 
         Args:
             target: target out of sight.
@@ -457,13 +457,8 @@ class TargetFusion:
         """
         assert target.filter is not None, "who is kept has one"
         seen_t = target.track.seen_t
-        before = target.estimate(seen_t - LONGEST_COVER_S)
-        if before is None:
-            return
-        speed = math.exp(before.state[LOG_DEPTH]) * float(np.linalg.norm(before.state[VELOCITY]))
-        width = self._profile.size * min(self._profile.shape or 1.0, 1.0)
-        cover_s = min(width / speed if speed else math.inf, LONGEST_COVER_S)
-        if t - seen_t > cover_s:
+        cover_s = min(2 * (seen_t - target.part_since_t), LONGEST_COVER_S)
+        if t - seen_t > cover_s > 0:
             target.filter = target.filter.without(seen_t - cover_s, seen_t)
 
     def _measure(self, target: Target, frame: Frame, mask: Image | None, finders: Sequence[Finder]) -> None:
@@ -480,6 +475,7 @@ class TargetFusion:
         assert target.filter is not None, "who measures has made one"
         track, box, sigma_px, size_px = target.track, target.track.box, None, None
         lacks = missing(track.size_px, box.size_px)
+        target.part_since_t = min(target.part_since_t, frame.t) if lacks.any() else math.inf
         if track.shared:  # its box covers other targets too: it bounds the place and shows no size
             sigma_px = np.hypot(room_inside(box.size_px, track.size_px), track.size_px / 2)
             box = Detection(track.center_px, np.zeros(2), track.score, clipped=True)

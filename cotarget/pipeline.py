@@ -70,6 +70,9 @@ GONE_S = 10.0
 MID_GREY = (128, 128, 128)
 # Longest interval that counts as the period of commands [s]; a longer one was a gap between frames.
 LONGEST_INTERVAL_S = 0.2
+# Time for which the lens stays after a target's track has ended [s]: who comes out from behind something is mostly as
+# far as before, and the lens takes a second each way.
+LENS_WAITS_S = 2.0
 HEAD = "head"  # name of the only head
 MOVED = math.radians(0.2)  # least angle by which a standing head was moved by something else [rad]
 Orders = Callable[[], Sequence[Order]]  # gives the orders of an operator that have come since the frame before
@@ -256,7 +259,7 @@ def outline_px(polygon: Polygon, image: Image) -> npt.NDArray[np.int32]:
 class State(enum.StrEnum):
     """State of the pipeline."""
 
-    SEARCHING = "searching"  # nothing to follow; the lens is at its shortest
+    SEARCHING = "searching"  # nothing to follow; the lens zooms out, but not at once after a target was lost
     FOLLOWING = "following"  # the head follows the target
     UNCONFIRMED = "unconfirmed"  # following, but the zoom camera should have shown the target for seconds and has not
     COASTING = "coasting"  # the target is out of sight for a moment; the head follows its prediction
@@ -497,6 +500,7 @@ class HeadRun:
         self._rig, self._settings = rig, settings
         self.selector, self.policy, self.mode = selector, selector, Mode.FOLLOWING
         self._why, self._goes_home = "", False
+        self._lost_t = -math.inf  # when the track of a followed target ended [s]
         self._rest: tuple[float, float] | None = None  # pan and tilt at which the head stands [rad]
         self._T_base_fixed = calibration.zoom_head.T_base_fixed
         self.search = ZoomSearch(
@@ -534,12 +538,16 @@ class HeadRun:
         candidates = candidates_of(targets, now, self._T_base_fixed, self._rig.fixed.size)
         number = self.selector.select(candidates, head, self._rig.head.limits)
         found = next((target for target in targets if target.id == number), None)
+        before = self.search.target
+        if found is None and before is not None and before not in targets:
+            self._lost_t = now
         self.search.search_for(found)
         return found
 
     def wait(self, found: Detections, tracks: Sequence[Track]) -> Outcome:
-        """Zoom out while no target is followed, and explain why none is."""
-        self.controller.zoom_out()
+        """Zoom out while no target is followed, but not at once after one was lost; explain why none is."""
+        if self._rig.clock.now() - self._lost_t >= LENS_WAITS_S:
+            self.controller.zoom_out()
         if unmet := self.selector.unmet:
             return State.SEARCHING, (unmet,), None
         if tracks:

@@ -1,5 +1,6 @@
 """Hold what is known of one target, in one record that all steps of the pipeline share."""
 
+import math
 from dataclasses import dataclass
 
 from cotarget.estimation import Estimate, TargetFilter
@@ -14,6 +15,7 @@ class Target:
         track: its track in the fixed camera, after the newest frame.
         filter: its 3D filter; None while others are more important, see `FusionSettings.most_filters`.
         largest_area_px: area of the largest box that showed all of it [px^2]; None before there is one.
+        part_since_t: time since which its boxes show parts of it [s]; inf while they show all of it.
         seen_well_s: time for which the head has shown it well in the close-up [s].
         unlikely: whether its size, or where the head sees it, contradicts the priors.
         unreachable: whether the head could not point at it.
@@ -22,6 +24,7 @@ class Target:
     track: Track
     filter: TargetFilter | None = None
     largest_area_px: float | None = None
+    part_since_t: float = math.inf
     seen_well_s: float = 0.0
     unlikely: bool = False
     unreachable: bool = False

@@ -139,12 +139,30 @@ def test_what_was_seen_while_a_target_went_behind_a_wall_moves_no_prediction():
 
     covered_t = (edge + 2.3) / 1.5
     count = math.floor((covered_t - 0.05) / FRAME_S)
-    seen_t = seen(fusion, lambda t: [track(1, shown(t), t)], count)
+    usual = shown(0.0).size_px
+    seen_t = seen(fusion, lambda t: [replace(track(1, shown(t), t), size_px=usual)], count)
     for i in range(count, count + 40):
         lost = replace(track(1, shown(seen_t), i * FRAME_S, missed=i - count + 1), seen_t=seen_t)
         fusion.show(i * FRAME_S, [lost])
     t = (count + 39) * FRAME_S
     assert fusion.estimate(1, t).x_fixed[0] == pytest.approx(-2.0 + 1.5 * t, abs=0.3)
+
+
+def test_a_person_who_set_off_before_a_wall_is_expected_behind_it():
+    """No box showed a part of him, so that nothing is left out."""
+    fusion, starts_t, hidden_t = Pair(PERSON), 1.0, 1.9
+
+    def across(t):
+        at_speed = starts_t + 0.5  # accelerates at 6 m/s^2 until then
+        return 3.0 * np.clip(t - starts_t, 0.0, 0.5) ** 2 + 3.0 * max(t - at_speed, 0.0)
+
+    count = math.floor(hidden_t / FRAME_S)
+    seen_t = seen(fusion, lambda t: [track(1, box_at(across(t), 0.0, 10.0, size=PERSON.size), t)], count)
+    for i in range(count, count + 22):
+        lost = track(1, box_at(across(seen_t), 0.0, 10.0, size=PERSON.size), i * FRAME_S, missed=i - count + 1)
+        fusion.show(i * FRAME_S, [replace(lost, seen_t=seen_t)])
+    t = (count + 21) * FRAME_S
+    assert fusion.estimate(1, t).x_fixed[0] == pytest.approx(across(t), abs=1.0)  # of 2.7 m unseen
 
 
 def test_a_missed_track_measures_nothing():
