@@ -144,7 +144,7 @@ def test_a_spot_in_a_large_picture_is_found_before_a_sky_and_not_among_leaves(ro
     leaves[478:482, 638:642] = 120 + 60
     fine = photograph(leaves, rng)
     half = cv2.resize(fine, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    boxes = [(*each.low, *each.size) for each in find_small_targets(half, 4.5, finer=[fine])]
+    boxes = [(*each.low, *each.size) for each in find_small_targets([fine, half], 4.5, first=1)]
     assert any(x <= 639 < x + w and y <= 479 < y + h for x, y, w, h in boxes) == found
 
 

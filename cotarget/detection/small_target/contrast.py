@@ -6,6 +6,7 @@ This is a constant false alarm rate detector (Rohling 1983) in two dimensions.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -62,35 +63,34 @@ class SmallTarget:
     whole: bool = False
 
 
+def pyramid(images: Sequence[Image], length: int) -> list[Image]:
+    """Halve the last of some images until there are ``length``, or it has a single row or column."""
+    levels = list(images)
+    while len(levels) < length and min(levels[-1].shape) > 1:
+        half = cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        levels.append(np.asarray(half, dtype=np.uint8))
+    return levels
+
+
 def find_small_targets(
-    grey: Image,
-    threshold: float,
-    *,
-    finer: Sequence[Image] = (),
-    of_difference: bool = False,
+    images: Sequence[Image], threshold: float, *, first: int = 0, of_difference: bool = False
 ) -> list[SmallTarget]:
     """Find regions that stand out at any scale, without overlaps, the strongest first.
 
     Args:
-        grey: image, (H, W).
+        images: image, (H, W), and its halvings; outlines and boxes are in pixels of the first.
         threshold: least contrast, in standard deviations of the surroundings.
-        finer: images of which ``grey`` is a halving, the finest first; outlines and boxes are in pixels of the first.
+        first: number of the finest in which targets are searched.
         of_difference: whether the image is a difference of two, in which dark regions and texture mean nothing.
     """
-    levels, first = [*finer, grey], len(finer)
     coarsest = first + SCALES - 1
-    peaks: list[_Peak] = []
-    for scale in range(first, coarsest + 1):
-        level = levels[scale]
-        if min(level.shape) < 2 * OUTER_HALF_PX:
-            break
-        levels.append(cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-        above = levels[scale - 1] if scale == first and first else None
-        peaks += _peaks(level, levels[-1], scale, threshold, above, scale == 0 and not of_difference)
+    levels = pyramid(images, coarsest + 2)
+    scales = [n for n in range(first, coarsest + 1) if min(levels[n].shape) >= 2 * OUTER_HALF_PX]
+    peaks = [peak for scale in scales for peak in _peaks(levels, scale, threshold, scale == first, of_difference)]
     peaks.sort(key=lambda peak: -peak.signal)
     kept: list[SmallTarget] = []
     for peak in peaks:
-        at = (peak.u + 0.5) * 2**peak.scale, (peak.v + 0.5) * 2**peak.scale
+        at = (peak.u + 0.5) * 2**peak.level, (peak.v + 0.5) * 2**peak.level
         if any(_contains(target, at) for target in kept):
             continue
         target = _outline(levels, peak, of_difference)
@@ -98,7 +98,7 @@ def find_small_targets(
             kept.append(target)
             if len(kept) == MOST_TARGETS:
                 break
-    if of_difference or len(levels) <= coarsest + 1:  # a small image is not searched at all scales
+    if of_difference or coarsest not in scales:  # a small image is not searched at all scales
         return kept
     texture = cv2.absdiff(levels[coarsest], cv2.blur(levels[coarsest], TEXTURE_PX))
     return [replace(target, beside=_beside(texture, target, 2**coarsest)) for target in kept]
@@ -122,79 +122,43 @@ def _beside(texture: Image, target: SmallTarget, unit: int) -> float:
     return float(window.max(initial=0))
 
 
-@dataclass(frozen=True)
-class _Peak:
-    """A peak of contrast: its pixel (u, v) at a scale, its signal, and the ring's mean."""
+class _Peak(NamedTuple):
+    """A peak of contrast: its pixel (u, v) in a level of the pyramid, its signal, and the ring's mean."""
 
     u: int
     v: int
-    scale: int
+    level: int
     signal: float
     around: float
 
 
-def _limits(mean: Array, deviation: Array, threshold: float, size: tuple[int, int]) -> tuple[Image, Image]:
-    """Grey levels beyond which a pixel stands out, in an image of a size (width, height) [px].
-
-    In bytes, which is three times as fast; half a grey level is little beside ``threshold`` deviations.
-    """
-    margin = deviation * np.float32(threshold)
-    low, high = cv2.subtract(mean, margin, dtype=cv2.CV_8U), cv2.add(mean, margin, dtype=cv2.CV_8U)
-    return np.asarray(cv2.resize(low, size), dtype=np.uint8), np.asarray(cv2.resize(high, size), dtype=np.uint8)
-
-
-def _peaks(
-    level: Image,
-    half: Image,
-    scale: int,
-    threshold: float,
-    finer: Image | None = None,
-    finest: bool = False,
-) -> list[_Peak]:
-    """Find peaks of contrast at one scale, the strongest first.
+def _peaks(levels: Sequence[Image], scale: int, threshold: float, finest: bool, of_difference: bool) -> list[_Peak]:
+    """Find peaks of contrast at one scale, the strongest first, each a pixel of the half of its image.
 
     Args:
-        level: image at this scale, (H, W).
-        half: the same in half the size.
+        levels: image, (H, W), and its halvings.
         scale: number of halvings.
         threshold: least contrast, in standard deviations of the surroundings.
-        finer: image of twice the size in which targets of one or two pixels are searched too; None for none.
-        finest: whether these are searched in this image instead.
+        finest: whether targets of one or two pixels are searched too, in the mean of 2x2 px or in twice the size.
+        of_difference: see `find_small_targets`.
     """
-    mean, deviation = _ring(half)
-    size = (level.shape[1], level.shape[0])
-    blurred = cv2.boxFilter(level, -1, (INNER_PX, INNER_PX))
-    searched = [(blurred, blurred, deviation)]  # darkest and brightest around each pixel, roughness of the surroundings
-    if finer is not None or finest:
+    mean, deviation = _ring(levels[scale + 1])
+    signal = _signal(cv2.blur(levels[scale], (INNER_PX,) * 2), mean, deviation, of_difference)
+    if finest and not of_difference:
+        if scale:
+            smallest = cv2.blur(levels[scale - 1], (INNER_PX,) * 2)
+        else:  # linear interpolation halfway between pixels is the mean of 2x2 px, at a third of blur's time
+            height, width = levels[0].shape
+            smallest = cv2.getRectSubPix(levels[0], (width, height), (width / 2 - 1, height / 2 - 1))
         rougher = deviation * np.float32(SMALLEST_TIMES) - np.float32((SMALLEST_TIMES - 1) * LEAST_ROUGHNESS)
-        if finer is None:
-            # Linear interpolation halfway between pixels is the mean of 2x2 px, at a third of boxFilter's time.
-            dark = bright = cv2.getRectSubPix(level, size, (size[0] / 2 - 1, size[1] / 2 - 1))
-        else:
-            blurred, pair = cv2.boxFilter(finer, -1, (INNER_PX, INNER_PX)), np.ones((2, 2), np.uint8)
-            dark, bright = (
-                cv2.resize(of(blurred, pair), size, interpolation=cv2.INTER_NEAREST) for of in (cv2.erode, cv2.dilate)
-            )
-        searched.append((dark, bright, rougher))
-    off = np.zeros(level.shape, np.uint8)
-    for dark, bright, roughness in searched:
-        low, high = _limits(mean, roughness, threshold, size)
-        off = cv2.max(off, cv2.max(cv2.subtract(low, dark), cv2.subtract(bright, high)))
-    mask = cv2.compare(off, 0, cv2.CMP_GT)
+        signal = cv2.max(signal, _signal(smallest, mean, rougher, of_difference))
+    mask = cv2.compare(signal, threshold, cv2.CMP_GT)
     peaks = []
     for contour in cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
         x, y, w, h = cv2.boundingRect(contour)
-        if max(w, h) > 2 * GUARD_HALF_PX:  # it reaches into its own ring and is left to the next scale
-            continue
-        _, _, _, (i, j) = cv2.minMaxLoc(off[y : y + h, x : x + w])
-        u, v = x + i, y + j
-        at = (min(v // 2, half.shape[0] - 1), min(u // 2, half.shape[1] - 1))
-        around = float(mean[at])
-        signal = max(
-            max(float(bright[v, u]) - around, around - float(dark[v, u])) / float(roughness[at])
-            for dark, bright, roughness in searched
-        )
-        peaks.append(_Peak(u, v, scale, signal, around))
+        if max(w, h) <= GUARD_HALF_PX:  # else it reaches into its own ring and is left to the next scale
+            _, most, _, (i, j) = cv2.minMaxLoc(signal[y : y + h, x : x + w])
+            peaks.append(_Peak(x + i, y + j, scale + 1, most, float(mean[y + j, x + i])))
     peaks.sort(key=lambda peak: -peak.signal)
     return peaks[:MOST_TARGETS]
 
@@ -202,21 +166,31 @@ def _peaks(
 def _ring(half: Image) -> tuple[Array, Array]:
     """Mean and deviation of the ring around each pixel of an image of half the size.
 
-    In place, which takes a third of the time of new arrays in an image of 640 px.
+    The deviation is averaged over 3x3 px, because where it is least by chance peaks are false.
     """
-    count = np.float32(OUTER_HALF_PX**2 - GUARD_HALF_PX**2)
-    mean, variance = _box_sum(half, cv2.boxFilter), _box_sum(half, cv2.sqrBoxFilter)
-    mean /= count
-    variance /= count
-    variance -= mean * mean
-    np.maximum(variance, np.float32(LEAST_ROUGHNESS**2), out=variance)
-    return mean, np.sqrt(variance, out=variance)
+    part = 1 / (OUTER_HALF_PX**2 - GUARD_HALF_PX**2)
+    means = []
+    for box in (cv2.boxFilter, cv2.sqrBoxFilter):
+        outer, guard = (box(half, cv2.CV_32F, (side,) * 2, normalize=False) for side in (OUTER_HALF_PX, GUARD_HALF_PX))
+        means.append(cv2.addWeighted(outer, part, guard, -part, 0.0, outer))
+    mean, square = means
+    variance = cv2.max(cv2.subtract(square, cv2.multiply(mean, mean), square), LEAST_ROUGHNESS**2, square)
+    return mean, cv2.blur(cv2.sqrt(variance, variance), (3, 3))
 
 
-def _box_sum(half: Image, box: Callable[..., Array]) -> Array:
-    """Sum of the image, or of its squares, over the ring around each pixel."""
-    total = box(half, cv2.CV_32F, (OUTER_HALF_PX,) * 2, normalize=False)
-    return cv2.subtract(total, box(half, cv2.CV_32F, (GUARD_HALF_PX,) * 2, normalize=False), total)
+def _signal(image: Image, mean: Array, deviation: Array, of_difference: bool) -> Array:
+    """Contrast of the brightest and darkest pixel of an image in each pixel of the ring's, in its deviations."""
+    height, width = mean.shape
+    side = round(image.shape[1] / width)
+
+    def extreme(of: Callable[..., Image]) -> Image:
+        there = of(image, np.ones((side, side), np.uint8), anchor=(0, 0))
+        return np.ascontiguousarray(there[::side, ::side][:height, :width])
+
+    contrast = cv2.subtract(extreme(cv2.dilate), mean, dtype=cv2.CV_32F)
+    if not of_difference:
+        contrast = cv2.max(contrast, cv2.subtract(mean, extreme(cv2.erode), dtype=cv2.CV_32F))
+    return cv2.divide(contrast, deviation)
 
 
 def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> SmallTarget | None:
@@ -227,21 +201,20 @@ def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> Small
         peak: the peak.
         of_difference: whether the target is brighter than its surroundings in all its parts, as in a difference.
     """
-    scale, around = peak.scale, peak.around
-    fine = max(0, scale - SCALES)
-    image, factor, unit = levels[fine], 2 ** (scale - fine), 2**fine
-    u, v = factor * peak.u + factor // 2, factor * peak.v + factor // 2
-    reach = factor * GUARD_HALF_PX
-    left, top = max(0, u - reach), max(0, v - reach)
-    window = image[top : v + reach + 1, left : u + reach + 1].astype(np.float32) - np.float32(around)
-    near = window[max(0, v - top - factor) : v - top + factor + 1, max(0, u - left - factor) : u - left + factor + 1]
-    j, i = divmod(int(np.abs(near).argmax()), near.shape[1])
-    contrast = float(near[j, i])
-    at = max(0, u - left - factor) + i, max(0, v - top - factor) + j
+    fine = max(0, peak.level - 1 - SCALES)
+    image, factor, unit, around = levels[fine], 2 ** (peak.level - fine), 2**fine, peak.around
+    u, v, reach, margin = factor * peak.u, factor * peak.v, factor * GUARD_HALF_PX // 2, factor // 2
+    left, top = max(0, u + margin - reach), max(0, v + margin - reach)
+    window = image[top : v + margin + reach + 1, left : u + margin + reach + 1]
+    i, j = max(0, u - left - margin), max(0, v - top - margin)
+    darkest, brightest, *places = cv2.minMaxLoc(window[j : v - top + factor + margin, i : u - left + factor + margin])
+    bright = of_difference or brightest - around >= around - darkest
+    contrast, (di, dj) = (brightest if bright else darkest) - around, places[bright]
     # An aeroplane has bright and dark parts.
-    inside = window * np.sign(contrast) if of_difference else np.abs(window)
-    there = (inside > OUTLINE * abs(contrast)).astype(np.uint8)
-    x, y, w, h = cv2.floodFill(there, None, at, (2,), flags=8)[3]
+    off = OUTLINE * abs(contrast)
+    least = 0 if of_difference else max(0, math.ceil(around - off))
+    beside = cv2.inRange(window, least, math.floor(around + off))
+    x, y, w, h = cv2.floodFill(beside, None, (i + di, j + dj), (1,), flags=8)[3]
     bottom, right = window.shape
     across = (x == 0 and left > 0) or (x + w == right and left + right < image.shape[1])
     down = (y == 0 and top > 0) or (y + h == bottom and top + bottom < image.shape[0])

@@ -16,9 +16,11 @@ from cotarget.detection.small_target.contrast import (
     INNER_PX,
     LEAST_ROUGHNESS,
     REACH_PX,
+    SCALES,
     SmallTarget,
     find_small_targets,
     mostly_in,
+    pyramid,
     share,
 )
 from cotarget.detection.small_target.plain import find_wholes
@@ -105,8 +107,9 @@ class SmallTargetFinder:
         found: list[Found] = []
         arrived: list[Found] = []
         noisy = times == MOST_TIMES and self._history.noise > LEAST_ROUGHNESS
-        small = find_small_targets(grey, NOISY_SIGNAL if noisy else LEAST_SIGNAL, finer=finer)
-        for target in [*find_wholes(grey, unit), *small]:
+        levels, first = pyramid([*finer, grey], len(finer) + SCALES + 1), len(finer)
+        small = find_small_targets(levels, NOISY_SIGNAL if noisy else LEAST_SIGNAL, first=first)
+        for target in [*find_wholes(levels[first:], unit), *small]:
             low = target.low[0] // unit, target.low[1] // unit
             size = -(-target.size[0] // unit), -(-target.size[1] // unit)
             since = changes(grey, low, size, target.around, self._history.noise, references)
@@ -170,9 +173,7 @@ class SmallTargetFinder:
         left, top, right, bottom = (left - REACH_PX, top - REACH_PX, left + width + REACH_PX, top + height + REACH_PX)
         left, top = max(0, left) // ALIGNED_PX * ALIGNED_PX, max(0, top) // ALIGNED_PX * ALIGNED_PX
         found = []
-        for target in find_small_targets(unusual[top:bottom, left:right], LEAST_DIFFERENCE, of_difference=True):
-            if target.contrast <= 0:
-                continue
+        for target in find_small_targets([unusual[top:bottom, left:right]], LEAST_DIFFERENCE, of_difference=True):
             score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE))
             (x, y), (w, h) = target.low, target.size
             target = replace(

@@ -5,19 +5,21 @@ it. A region is what differs from it by more than the usual difference.
 """
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cotarget.detection.base import pieces
-from cotarget.detection.small_target.contrast import OUTLINE, SmallTarget
+from cotarget.detection.small_target.contrast import OUTLINE, SCALES, SmallTarget
 from cotarget.rig import Image
 
 Box = tuple[int, int, int, int]  # left, top, width and height [px]
-# Image in which the background is found, in which regions are found, and the least larger side of a region, in parts of
-# the image's width.
-COARSE_PART, FINE_PART, LEAST_PART = 8 / 640, 2 / 640, 40 / 640
+# Number of halvings of the image in which regions are found, and of that in which the background is found.
+FINE, COARSE = 1, SCALES
+# Least larger side of a region, in parts of the image's width.
+LEAST_PART = 40 / 640
 # Side of the median's window, in parts of the image's width.
 WINDOW_PART = 0.5
 # Least difference from the background: in usual differences, and in grey levels.
@@ -34,20 +36,18 @@ GAP_PX = 5
 SAMPLES = 1000
 
 
-def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
+def find_wholes(levels: Sequence[Image], times: int) -> list[SmallTarget]:
     """Find the regions of an image (H, W) that stand out before a plain background.
 
     Args:
-        grey: the image.
+        levels: the image and its halvings.
         times: factor from its pixels to those of the regions.
     """
+    if len(levels) <= COARSE:
+        return []
+    grey, fine, small = levels[0], levels[FINE], levels[COARSE]
     height, width = grey.shape
-    unit = max(1, round(FINE_PART * width))
-    coarse = max(1, round(COARSE_PART * width))
-    fine, small = (
-        cv2.resize(grey, (max(1, width // side), max(1, height // side)), interpolation=cv2.INTER_AREA)
-        for side in (unit, coarse)
-    )
+    unit = 2**FINE
     side = 2 * round(WINDOW_PART * small.shape[1] / 2) + 1
     ground = cv2.resize(cv2.blur(cv2.medianBlur(small, side), (5, 5)), fine.shape[::-1], interpolation=cv2.INTER_LINEAR)
     sharp = cv2.absdiff(fine, ground)
@@ -57,7 +57,7 @@ def find_wholes(grey: Image, times: int) -> list[SmallTarget]:
     mask = cv2.compare(off, TIMES * usual, cv2.CMP_GT)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
     found = []
-    boxes = cv2.connectedComponentsWithStats(mask)[2][1:, :4]  # the first is the background
+    boxes = cv2.connectedComponentsWithStats(mask, ltype=cv2.CV_16U)[2][1:, :4]  # the first is the background
     for x, y, w, h in boxes[unit * boxes[:, 2:].max(axis=1) >= LEAST_PART * width].tolist():
         contrast = float(sharp[y : y + h, x : x + w].max())
         body = sharp[y : y + h, x : x + w] > max(TIMES * usual, FAINTEST * contrast)
