@@ -83,7 +83,7 @@ class TrailBox(NamedTuple):
 
     Attributes:
         t: time [s].
-        edges: low and high edge along u and v [px].
+        edges: low and high edge along u and v in the scene [px].
         step: motion since the box before [px].
         area: area [px^2]; inf for a clipped box, whose visible edges are the target's.
     """
@@ -184,7 +184,14 @@ class Trail:
         self._extents = image_size or (None, None)
         self._boxes: list[TrailBox] = []
 
-    def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
+    def add(
+        self,
+        t: float,
+        center: tuple[float, float],
+        size: tuple[float, float],
+        clipped: bool,
+        shift: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         """Add a box, and forget whole boxes that showed only a part of the target.
 
         Args:
@@ -192,21 +199,13 @@ class Trail:
             center: centre of the box (u, v) [px].
             size: width and height of the box [px].
             clipped: whether the image's border cuts the box.
+            shift: shift of the scene since the first box (du, dv) [px].
         """
-        across, down = (_edges(*of, clipped) for of in zip(center, size, self._extents, strict=True))
+        across, down = (_edges(*of, clipped) for of in zip(center, size, self._extents, shift, strict=True))
         begin, area = t - self._span_s, math.prod(size)
         self._boxes = [box for box in self._boxes if box.t >= begin and LARGEST_AREA_RATIO * box.area >= area]
         step = _common_motion([self._boxes[-1].edges], [(across, down)]) if self._boxes else 0.0
         self._boxes.append(TrailBox(t, (across, down), step, math.inf if clipped else area))
-
-    def move(self, by: Array) -> None:
-        """Move all boxes with the scene, by (du, dv) [px]."""
-        du, dv = by.tolist()
-        self._boxes = [
-            box._replace(edges=((left + du, right + du), (top + dv, bottom + dv)))
-            for box in self._boxes
-            for (left, right), (top, bottom) in [box.edges]
-        ]
 
     def travel(self) -> float:
         """Compute how far the target has moved, edge by edge [px]; 0 if it jumped.
@@ -221,12 +220,15 @@ class Trail:
         return way if longest <= LARGEST_STEP * way else 0.0
 
 
-def _edges(center: float, size: float, extent: int | None, clipped: bool) -> Edges:
-    """Low and high edge of a box along one axis [px]; nan for that of a clipped box in the outermost pixel."""
+def _edges(center: float, size: float, extent: int | None, shift: float, clipped: bool) -> Edges:
+    """Low and high edge of a box along one axis, where they were before the scene moved by ``shift`` [px].
+
+    Of a clipped box, an edge in the outermost pixel is nan.
+    """
     low, high = center - size / 2, center + size / 2
-    if not clipped or extent is None:
-        return low, high
-    return low if low > 0.5 else math.nan, high if high < extent - 1.5 else math.nan
+    if clipped and extent is not None:
+        low, high = low if low > 0.5 else math.nan, high if high < extent - 1.5 else math.nan
+    return low - shift, high - shift
 
 
 def _common_motion(before: Sequence[tuple[Edges, Edges]], after: Sequence[tuple[Edges, Edges]]) -> float:
@@ -445,6 +447,7 @@ class LiveTrack:
         self._sizes = SizeHistory(settings.size_s, settings.trend)
         # Travel is needed until the track is confirmed, and only if the settings ask for it.
         self._trail = Trail(settings.travel_s, image_size) if settings.confirm_travel else None
+        self._shift = (0.0, 0.0)  # of the scene since the first detection [px]
         self._add_box(detection)
         self._first = self._edges(detection)
         self._whole = not detection.clipped  # whether any box was not clipped
@@ -492,9 +495,8 @@ class LiveTrack:
             return
         for axis, shift in zip(self._axes, by.tolist(), strict=True):
             axis.position += shift
-        self._first = [(low + shift, high + shift) for (low, high), shift in zip(self._first, by.tolist(), strict=True)]
-        if self._trail is not None:
-            self._trail.move(by)
+        (u, v), (du, dv) = self._shift, by.tolist()
+        self._shift = u + du, v + dv
 
     def correct(self, detection: Detection) -> None:
         """Correct with a detection of this track alone."""
@@ -593,9 +595,9 @@ class LiveTrack:
     def _add_box(self, detection: Detection) -> None:
         """Add a box to the histories."""
         (u, v), (width, height) = detection.center_px.tolist(), detection.size_px.tolist()
-        for history in (self._sizes, self._trail):
-            if history is not None:
-                history.add(self.t, (u, v), (width, height), detection.clipped)
+        self._sizes.add(self.t, (u, v), (width, height), detection.clipped)
+        if self._trail is not None:
+            self._trail.add(self.t, (u, v), (width, height), detection.clipped, self._shift)
 
     def _begin(self, detection: Detection) -> list[AxisFilter]:
         """Make filters that begin at a box, with the velocity of the edges in view since the first box.
@@ -613,10 +615,10 @@ class LiveTrack:
         return axes
 
     def _edges(self, detection: Detection) -> list[Edges]:
-        """Edges of a box along u and v, see `_edges`."""
+        """Edges of a box along u and v in the scene, see `_edges`."""
         extents = self._image_size or (None, None)
-        sides = zip(detection.center_px.tolist(), detection.size_px.tolist(), extents, strict=True)
-        return [_edges(center, size, extent, detection.clipped) for center, size, extent in sides]
+        sides = zip(detection.center_px.tolist(), detection.size_px.tolist(), extents, self._shift, strict=True)
+        return [_edges(center, size, extent, shift, detection.clipped) for center, size, extent, shift in sides]
 
     def _has_evidence(self) -> bool:
         """Whether the score shows a target, or the travel together with half that score."""

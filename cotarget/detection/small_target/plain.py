@@ -46,8 +46,7 @@ def find_wholes(levels: Sequence[Image], times: int) -> list[SmallTarget]:
     if len(levels) <= COARSE:
         return []
     grey, fine, small = levels[0], levels[FINE], levels[COARSE]
-    height, width = grey.shape
-    unit = 2**FINE
+    width, unit = grey.shape[1], 2**FINE
     side = 2 * round(WINDOW_PART * small.shape[1] / 2) + 1
     ground = cv2.resize(cv2.blur(cv2.medianBlur(small, side), (5, 5)), fine.shape[::-1], interpolation=cv2.INTER_LINEAR)
     sharp = cv2.absdiff(fine, ground)
