@@ -211,25 +211,23 @@ class Clutter:
         Returns:
             The targets, in their order.
         """
-        side = width / CELLS
         if self._usual is None:
             self._usual, self._t = np.zeros((2 * CELLS, CELLS)), t
-        now = np.zeros_like(self._usual)
-        weighed = []
         is_free = ~np.any(_within(found, held), axis=1)
         scores = is_free * [each.score for each in found]
         crowds = _alike(found, found) @ scores - scores
-        for each, free, crowd in zip(found, is_free.tolist(), crowds.tolist(), strict=True):
-            if free:
-                u, v = np.clip(each.center_px / side, 0, (CELLS - 1, 2 * CELLS - 1)).astype(int).tolist()
-                nearby = now[max(0, v - 1) : v + 2, max(0, u - 1) : u + 2]
-                np.maximum(nearby, each.score, out=nearby)
-                even = each.score / (1 + float(self._usual[v, u]) / CLUTTER_EVEN + crowd / CROWD_EVEN)
-                each = replace(each, score=even / (even + 1 - each.score))
-            weighed.append(each)
-        self._usual += np.clip((t - self._t) / CLUTTER_S, 0.0, 1.0) * (now - self._usual)
+        places = np.reshape([each.center_px for each in found], (-1, 2)) * CELLS / width
+        u, v = np.clip(places, 0, (CELLS - 1, 2 * CELLS - 1)).astype(int).T
+        even = scores / (1 + self._usual[v, u] / CLUTTER_EVEN + crowds / CROWD_EVEN)
+        now = np.zeros_like(self._usual)
+        np.maximum.at(now, (v, u), scores)
+        cv2.accumulateWeighted(cv2.dilate(now, None), self._usual, np.clip((t - self._t) / CLUTTER_S, 0.0, 1.0))
         self._t = t
-        return weighed
+        lowered = (even / (even + 1 - scores)).tolist()
+        return [
+            replace(each, score=score) if free else each
+            for each, score, free in zip(found, lowered, is_free.tolist(), strict=True)
+        ]
 
 
 def fuse(

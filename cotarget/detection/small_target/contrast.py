@@ -143,6 +143,8 @@ def _peaks(levels: Sequence[Image], scale: int, threshold: float, finest: bool, 
         of_difference: see `find_small_targets`.
     """
     mean, deviation = _ring(levels[scale + 1])
+    if not of_difference:  # where the deviation of texture is least by chance, peaks are false
+        deviation = cv2.blur(deviation, (3, 3))
     signal = _signal(cv2.blur(levels[scale], (INNER_PX,) * 2), mean, deviation, of_difference)
     if finest and not of_difference:
         if scale:
@@ -164,10 +166,7 @@ def _peaks(levels: Sequence[Image], scale: int, threshold: float, finest: bool, 
 
 
 def _ring(half: Image) -> tuple[Array, Array]:
-    """Mean and deviation of the ring around each pixel of an image of half the size.
-
-    The deviation is averaged over 3x3 px, because where it is least by chance peaks are false.
-    """
+    """Mean and deviation of the ring around each pixel of an image of half the size."""
     part = 1 / (OUTER_HALF_PX**2 - GUARD_HALF_PX**2)
     means = []
     for box in (cv2.boxFilter, cv2.sqrBoxFilter):
@@ -175,7 +174,7 @@ def _ring(half: Image) -> tuple[Array, Array]:
         means.append(cv2.addWeighted(outer, part, guard, -part, 0.0, outer))
     mean, square = means
     variance = cv2.max(cv2.subtract(square, cv2.multiply(mean, mean), square), LEAST_ROUGHNESS**2, square)
-    return mean, cv2.blur(cv2.sqrt(variance, variance), (3, 3))
+    return mean, cv2.sqrt(variance, variance)
 
 
 def _signal(image: Image, mean: Array, deviation: Array, of_difference: bool) -> Array:
@@ -203,7 +202,7 @@ def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> Small
     """
     fine = max(0, peak.level - 1 - SCALES)
     image, factor, unit, around = levels[fine], 2 ** (peak.level - fine), 2**fine, peak.around
-    u, v, reach, margin = factor * peak.u, factor * peak.v, factor * GUARD_HALF_PX // 2, factor // 2
+    u, v, reach, margin = factor * peak.u, factor * peak.v, factor * (GUARD_HALF_PX + 1) // 2, factor // 2
     left, top = max(0, u + margin - reach), max(0, v + margin - reach)
     window = image[top : v + margin + reach + 1, left : u + margin + reach + 1]
     i, j = max(0, u - left - margin), max(0, v - top - margin)
