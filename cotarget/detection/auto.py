@@ -29,8 +29,6 @@ from cotarget.rig import Detection, Frame, Image
 # In parts of the image's width: most that a camera shakes, more is a pan; and shift at which the background is learnt
 # again, because too much of it is out of view.
 SHAKE_PART, VIEW_PART = 3 / 640, 0.1
-# Largest texture beside a target before a plain background [grey levels].
-PLAIN = 5.0
 # Part of a large target that a small one covers if they are the same target, of a small one that is a part of a large
 # one, and of a small one that is much larger: less than this is covered.
 SAME = 0.5
@@ -120,7 +118,7 @@ class AutoDetector:
         like = partial(likeness, shape=self._shape)
         if shift_px is not None and self._with_background:
             self._large = self._large_finder.find(frame, self._held, shift_px, exposure, images)
-            outlined = [target.whole or target.beside <= PLAIN for target in targets]
+            outlined = [target.whole for target in targets]
             followed = self._are_followed(small, frame.t, width)
             found = fuse(small, outlined, followed, self._large.boxes, like)
         found = [each for each in found if each.size_px.max() >= self._least_part * width]

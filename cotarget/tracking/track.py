@@ -265,8 +265,6 @@ CUT = 0.5
 PIECE = 0.7
 
 
-# Time for which a confirmed track is predicted after a cut of the film, or a blow at the camera [s].
-AFTER_CUT_S = 0.3
 # Width of the images for which the settings hold [px].
 USUAL_WIDTH_PX = 640
 
@@ -291,7 +289,7 @@ class TrackingSettings:
             `lose_s`.
         score_s: time constant of the average score [s]; a new track begins at 0.
         lose_s: time without such a detection after which a confirmed track ends [s]; its age if that is less.
-        drop_s: time without a detection after which an unconfirmed track ends [s].
+        drop_s: time without a detection after which an unconfirmed track ends, and any after a cut of the film [s].
         size_s: window of the size's median, some two wing beats [s].
         trend: whether the size follows a target that grows or shrinks. Wings look as if it did.
         gate: gate on the squared Mahalanobis distance of place and size, 99.9 % of a chi-square with three degrees of
@@ -302,10 +300,9 @@ class TrackingSettings:
             target than a new object, because after 0.8 s the gate reaches over 250 px. Real films of birds and people
             have up to 4 a second; below 1, tracks jump to other targets, and from 8 on, hidden birds are not found
             again.
-        overlap_enough: overlap from which a box may belong to a track even outside the gate: the target merged with
-            something else.
         covered: a detection that covers this part of a track's predicted box explains the track, even if another has
-            won it, but not if it is much larger and the track has just been found.
+            won it, but not if it is much larger and the track has just been found. With an overlap of it, a box may
+            belong to a track even outside the gate: the target merged with something else.
         most_detections: most detections of a frame that are used: snow, rain or flicker must not delay the next frame.
             Real films of birds and of a dozen people have up to 10.
     """
@@ -329,7 +326,6 @@ class TrackingSettings:
     gate: float = 16.3
     size_sigma: float = 0.5
     newcomers_hz: float = 2.0
-    overlap_enough: float = 0.3
     covered: float = 0.5
     most_detections: int = 100
 
@@ -529,10 +525,9 @@ class LiveTrack:
     @property
     def timeout_s(self) -> float:
         """Longest time without a detection before the track ends [s]."""
-        if not self.confirmed:
-            return self.settings.drop_s
-        longest = AFTER_CUT_S if self.after_cut else self.settings.lose_s
-        return min(longest, self.seen - self.born)
+        if self.confirmed and not self.after_cut:
+            return min(self.settings.lose_s, self.seen - self.born)
+        return self.settings.drop_s
 
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
         """Whether the track is dropped: no detection for too long, or outside the image."""

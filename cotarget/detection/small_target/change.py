@@ -18,17 +18,14 @@ AGES_S = (0.07, 0.17, 0.5, 1.0)
 AGE_TOLERANCE = 0.5
 # Least time between two kept images [s].
 SPACING_S = 0.03
-# Search for the best match: this many pixels if the camera stands; plus this part of its shift, for parallax and
-# distortion; at most this many, beyond which a target has moved [px].
-SEARCH_PX, SEARCH_PART, MOST_SEARCH_PX = 1, 0.05, 4
+# How far the best match is searched; beyond it a target has moved [px].
+SEARCH_PX = 1
 # Margin around the target's box that is compared as well [px].
 MARGIN_PX = 2
 # Least noise, from coding and quantisation, where nothing happens [grey levels].
 LEAST_NOISE = 1.0
 # Every how many pixels the noise is sampled, from the difference to the last frame.
 NOISE_STRIDE = 8
-# Median of a normal distribution's absolute values over its standard deviation.
-MEDIAN_OF_NORMAL = 0.6745
 
 
 @dataclass(frozen=True)
@@ -38,12 +35,10 @@ class Reference:
     Attributes:
         image: the image, (H, W).
         shift: shift of the scene from now to then (du, dv) [px].
-        search: how far a match is searched [px].
     """
 
     image: Image
     shift: tuple[float, float]
-    search: int
 
 
 class History:
@@ -83,7 +78,7 @@ class History:
             # The usual differences are averaged, because their median is coarse in whole grey levels and moving things
             # must not count. True noise of 1 to 8 levels gives 1.2 to 7.8; the thresholds were chosen with that.
             usual = difference[difference <= 2 * float(np.median(difference)) + 2]
-            self.noise = max(LEAST_NOISE, float(usual.mean()) / MEDIAN_OF_NORMAL / np.sqrt(2.0))
+            self.noise = max(LEAST_NOISE, float(usual.mean()))
         self._last = grey
         if abs(exposure / self._last_exposure - 1) > FLICKER:
             self._kept.clear()
@@ -119,8 +114,7 @@ class History:
                 continue
             _, image, shift_then, _ = self._kept[int(off.argmin())]
             du, dv = (shift_then - shift).tolist()
-            search = min(MOST_SEARCH_PX, SEARCH_PX + round(SEARCH_PART * math.hypot(du, dv)))
-            found.append(Reference(image, (du, dv), search))
+            found.append(Reference(image, (du, dv)))
         return found
 
 
@@ -164,7 +158,7 @@ def changes(
             found.append(0.0)
             continue
         # getRectSubPix takes the centre of a patch: n pixels from column x are centred at x + (n - 1) / 2.
-        size, center = (w + 2 * before.search, h + 2 * before.search), (x + (w - 1) / 2, y + (h - 1) / 2)
+        size, center = (w + 2 * SEARCH_PX, h + 2 * SEARCH_PX), (x + (w - 1) / 2, y + (h - 1) / 2)
         then = cv2.getRectSubPix(before.image, size, center, patchType=cv2.CV_32F)
         then += np.float32(level - _level(then))  # flickering light is no change
         squared = _least(cv2.matchTemplate(then, now, cv2.TM_SQDIFF))

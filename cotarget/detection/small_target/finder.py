@@ -30,8 +30,6 @@ from cotarget.rig import Detection, Frame, Image
 
 # Least contrast, in standard deviations of the surroundings.
 LEAST_SIGNAL = 4.5
-# Steepness of the score of a region of the difference.
-SLOPE = 3.4
 # Least score of a detection. The tracker begins no track with so little; a target that hovers before trees keeps it.
 LEAST_SCORE = 0.005
 # Score and change from which a region has arrived as a whole: it is more likely a target than not, and half of it was
@@ -40,8 +38,6 @@ ARRIVED = 0.5
 # Least signal in the difference from all earlier images, and the signal with a score of 0.5. In the simulated field,
 # swaying foliage is above the latter once in six frames, anywhere; a bird in front of it in nineteen of twenty.
 LEAST_DIFFERENCE, EVEN_DIFFERENCE = 7.0, 12.0
-# Fewest of the AGES_S for which there must be an image.
-FEWEST_EARLIER = 3
 # Shift of the camera between two images up to which they are subtracted [px].
 SHAKING_PX = 5.0
 # Usual difference, such as of a swaying branch, subtracted from the difference: its factor, the time constant of its
@@ -140,13 +136,13 @@ class SmallTargetFinder:
         times: int,
         references: Sequence[Reference | None],
     ) -> list[Found]:
-        """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
+        """Find regions in the difference from earlier images of all AGES_S, if the camera hardly moved.
 
         The difference of an image enlarged by a factor ``times`` is halved: a twig sways over more of its pixels.
         """
         earlier = [kept for kept in references if kept is not None]
         shifts = [max(map(abs, kept.shift)) for kept in earlier]
-        if len(earlier) < FEWEST_EARLIER or max(shifts) > times * SHAKING_PX:
+        if len(earlier) < len(AGES_S) or max(shifts) > times * SHAKING_PX:
             self._usual = None
             return []
         registered = (
@@ -174,7 +170,7 @@ class SmallTargetFinder:
         left, top = max(0, left) // ALIGNED_PX * ALIGNED_PX, max(0, top) // ALIGNED_PX * ALIGNED_PX
         found = []
         for target in find_small_targets([unusual[top:bottom, left:right]], LEAST_DIFFERENCE, of_difference=True):
-            score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE))
+            score = float(1 / (1 + (EVEN_DIFFERENCE / target.signal) ** self._weights[0]))
             (x, y), (w, h) = target.low, target.size
             target = replace(
                 target, low=(pixel * (left + x), pixel * (top + y)), size=(pixel * w, pixel * h), beside=math.inf
