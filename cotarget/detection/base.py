@@ -28,8 +28,6 @@ Tracks = Sequence["Track"]
 FOREGROUND = 255
 # Largest part of foreground that may be targets; beyond it, the light or the camera has changed.
 MOST_FOREGROUND = 0.45
-# Cells along the image's width and height: in which brightness is compared, and of each the strongest corner is tracked.
-CELLS = (16, 12)
 # Shift of a camera up to which it stands, because its measurement has that noise [parts of the image's width].
 QUIET_PART = 0.5 / 640
 # Time for which a picture must be another, or a camera must stand, before it counts: a flash is shorter [s].

@@ -6,10 +6,12 @@ import cv2
 import numpy as np
 
 from cotarget.detection.background import BRIGHTEST, HISTORY_S
-from cotarget.detection.base import CELLS, LASTING_S
+from cotarget.detection.base import LASTING_S
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
+# Cells along width and height in which brightness is compared.
+CELLS = (32, 24)
 # Deviation of a cell from the common change up to which it agrees, least part of the cells that do, and least change.
 # Beyond these, the picture has changed and not the exposure.
 AGREEMENT, FEWEST, DARKEST = 0.1, 0.5, 1 / 3

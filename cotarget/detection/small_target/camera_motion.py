@@ -6,12 +6,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.detection.base import CELLS
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
 # Factor by which the image is reduced before corners are tracked; full size gives no better shift at twice the cost.
 SCALE = 2
+# Cells along width and height; of each, the strongest corner is tracked, so that a large target does not have most.
+CORNER_CELLS = (16, 12)
 # Least eigenvalue of a corner, of cv2.cornerMinEigenVal: noise of 5 grey levels reaches it. In an image of sky
 # alone, the strongest corners are the target and artefacts of the codec.
 LEAST_CORNER = 3e-4
@@ -117,12 +118,9 @@ class CameraMotion:
 
 
 def _corners(picture: Image) -> npt.NDArray[np.float32]:
-    """Detect the strongest corner of each cell that is stronger than noise, (n, 1, 2).
-
-    So a large target does not have most of them.
-    """
+    """Detect the strongest corner of each cell that is stronger than noise, (n, 1, 2)."""
     strength = cv2.cornerMinEigenVal(picture, CORNER_BLOCK)
-    columns, rows = CELLS
+    columns, rows = CORNER_CELLS
     height, width = -(-picture.shape[0] // rows), -(-picture.shape[1] // columns)  # of a cell
     below, beside = rows * height - picture.shape[0], columns * width - picture.shape[1]
     whole = cv2.copyMakeBorder(strength, 0, below, 0, beside, cv2.BORDER_CONSTANT)

@@ -146,23 +146,26 @@ def changes(
     patch = grey[top : low[1] + size[1] + MARGIN_PX, left : low[0] + size[0] + MARGIN_PX]
     h, w = patch.shape
     now = patch.astype(np.float32)
-    level = _level(now)
-    energy = float(np.square(now - np.float32(around)).sum()) + noise**2 * w * h
-    found = []
-    for before in references:
+    level, variance = _level(now), noise**2 * w * h
+    energy = float(np.square(now - np.float32(around)).sum()) + variance
+    found = [math.nan if before is None else 0.0 for before in references]
+    patches, ages = [], []
+    size = (w + 2 * SEARCH_PX, h + 2 * SEARCH_PX)
+    for age, before in enumerate(references):
         if before is None:
-            found.append(math.nan)
             continue
         x, y = left + before.shift[0], top + before.shift[1]
-        if not (-0.5 <= x <= grey.shape[1] - w + 0.5 and -0.5 <= y <= grey.shape[0] - h + 0.5):
-            found.append(0.0)
-            continue
-        # getRectSubPix takes the centre of a patch: n pixels from column x are centred at x + (n - 1) / 2.
-        size, center = (w + 2 * SEARCH_PX, h + 2 * SEARCH_PX), (x + (w - 1) / 2, y + (h - 1) / 2)
-        then = cv2.getRectSubPix(before.image, size, center, patchType=cv2.CV_32F)
-        then += np.float32(level - _level(then))  # flickering light is no change
-        squared = _least(cv2.matchTemplate(then, now, cv2.TM_SQDIFF))
-        found.append(max(0.0, squared - 2 * noise**2 * w * h) / energy)
+        if -0.5 <= x <= grey.shape[1] - w + 0.5 and -0.5 <= y <= grey.shape[0] - h + 0.5:
+            # getRectSubPix takes the centre of a patch: n pixels from column x are centred at x + (n - 1) / 2.
+            center = (x + (w - 1) / 2, y + (h - 1) / 2)
+            then = cv2.getRectSubPix(before.image, size, center, patchType=cv2.CV_32F)
+            patches.append(then + np.float32(level - _level(then)))  # flickering light is no change
+            ages.append(age)
+    if patches:  # all ages at once, because for small patches a call takes longer than its arithmetic
+        squared = cv2.matchTemplate(cv2.hconcat(patches), now, cv2.TM_SQDIFF)
+        for i, age in enumerate(ages):
+            least = _least(squared[:, i * size[0] : i * size[0] + 2 * SEARCH_PX + 1])
+            found[age] = max(0.0, least - 2 * variance) / energy
     return found
 
 
@@ -186,4 +189,6 @@ def _below(least: float, before: float, after: float) -> float:
 
 def _level(patch: np.ndarray) -> float:
     """Mean grey level of a patch's rim, which is the target's surroundings."""
-    return (cv2.mean(patch[0])[0] + cv2.mean(patch[-1])[0] + cv2.mean(patch[:, :1])[0] + cv2.mean(patch[:, -1:])[0]) / 4
+    inside = patch[1:-1, 1:-1]
+    rim = cv2.sumElems(patch)[0] - cv2.sumElems(inside)[0]
+    return rim / (patch.size - inside.size)

@@ -4,7 +4,7 @@ This is a constant false alarm rate detector (Rohling 1983) in two dimensions.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -90,7 +90,7 @@ def find_small_targets(
     peaks.sort(key=lambda peak: -peak.signal)
     kept: list[SmallTarget] = []
     for peak in peaks:
-        at = (peak.u + 0.5) * 2**peak.level, (peak.v + 0.5) * 2**peak.level
+        at = (peak.u + 0.5) * 2**peak.scale, (peak.v + 0.5) * 2**peak.scale
         if any(_contains(target, at) for target in kept):
             continue
         target = _outline(levels, peak, of_difference)
@@ -123,17 +123,17 @@ def _beside(texture: Image, target: SmallTarget, unit: int) -> float:
 
 
 class _Peak(NamedTuple):
-    """A peak of contrast: its pixel (u, v) in a level of the pyramid, its signal, and the ring's mean."""
+    """A peak of contrast: its pixel (u, v) at a scale, its signal, and the ring's mean."""
 
     u: int
     v: int
-    level: int
+    scale: int
     signal: float
     around: float
 
 
 def _peaks(levels: Sequence[Image], scale: int, threshold: float, finest: bool, of_difference: bool) -> list[_Peak]:
-    """Find peaks of contrast at one scale, the strongest first, each a pixel of the half of its image.
+    """Find peaks of contrast at one scale, the strongest first.
 
     Args:
         levels: image, (H, W), and its halvings.
@@ -142,25 +142,44 @@ def _peaks(levels: Sequence[Image], scale: int, threshold: float, finest: bool, 
         finest: whether targets of one or two pixels are searched too, in the mean of 2x2 px or in twice the size.
         of_difference: see `find_small_targets`.
     """
-    mean, deviation = _ring(levels[scale + 1])
-    if not of_difference:  # where the deviation of texture is least by chance, peaks are false
-        deviation = cv2.blur(deviation, (3, 3))
-    signal = _signal(cv2.blur(levels[scale], (INNER_PX,) * 2), mean, deviation, of_difference)
+    level, (mean, deviation) = levels[scale], _ring(levels[scale + 1])
+    width, height = size = level.shape[1], level.shape[0]
+    blurred = cv2.blur(level, (INNER_PX,) * 2)
+    searched = [(blurred, blurred, deviation)]  # darkest and brightest around each pixel, roughness of the surroundings
     if finest and not of_difference:
-        if scale:
-            smallest = cv2.blur(levels[scale - 1], (INNER_PX,) * 2)
-        else:  # linear interpolation halfway between pixels is the mean of 2x2 px, at a third of blur's time
-            height, width = levels[0].shape
-            smallest = cv2.getRectSubPix(levels[0], (width, height), (width / 2 - 1, height / 2 - 1))
         rougher = deviation * np.float32(SMALLEST_TIMES) - np.float32((SMALLEST_TIMES - 1) * LEAST_ROUGHNESS)
-        signal = cv2.max(signal, _signal(smallest, mean, rougher, of_difference))
-    mask = cv2.compare(signal, threshold, cv2.CMP_GT)
+        if scale:
+            finer, pair = cv2.blur(levels[scale - 1], (INNER_PX,) * 2), np.ones((2, 2), np.uint8)
+            dark, bright = (
+                cv2.resize(of(finer, pair), size, interpolation=cv2.INTER_NEAREST) for of in (cv2.erode, cv2.dilate)
+            )
+        else:
+            # Linear interpolation halfway between pixels is the mean of 2x2 px, at a third of blur's time.
+            dark = bright = cv2.getRectSubPix(level, size, (width / 2 - 1, height / 2 - 1))
+        searched.append((dark, bright, rougher))
+    off: Image | None = None  # by how much each pixel stands out beyond the threshold
+    for dark, bright, roughness in searched:
+        # In bytes, which is three times as fast; half a grey level is little beside the threshold.
+        margin = roughness * np.float32(threshold)
+        sides = [cv2.subtract(bright, cv2.resize(cv2.add(mean, margin, dtype=cv2.CV_8U), size))]
+        if not of_difference:
+            sides.append(cv2.subtract(cv2.resize(cv2.subtract(mean, margin, dtype=cv2.CV_8U), size), dark))
+        for side in sides:
+            off = side if off is None else cv2.max(off, side, off)
     peaks = []
-    for contour in cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
+    for contour in cv2.findContours(cv2.compare(off, 0, cv2.CMP_GT), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
         x, y, w, h = cv2.boundingRect(contour)
-        if max(w, h) <= GUARD_HALF_PX:  # else it reaches into its own ring and is left to the next scale
-            _, most, _, (i, j) = cv2.minMaxLoc(signal[y : y + h, x : x + w])
-            peaks.append(_Peak(x + i, y + j, scale + 1, most, float(mean[y + j, x + i])))
+        if max(w, h) > 2 * GUARD_HALF_PX:  # it reaches into its own ring and is left to the next scale
+            continue
+        _, _, _, (i, j) = cv2.minMaxLoc(off[y : y + h, x : x + w])
+        u, v = x + i, y + j
+        at = (min(v // 2, mean.shape[0] - 1), min(u // 2, mean.shape[1] - 1))
+        around = float(mean[at])
+        signal = max(
+            max(float(bright[v, u]) - around, around - float(dark[v, u])) / float(roughness[at])
+            for dark, bright, roughness in searched
+        )
+        peaks.append(_Peak(u, v, scale, signal, around))
     peaks.sort(key=lambda peak: -peak.signal)
     return peaks[:MOST_TARGETS]
 
@@ -177,21 +196,6 @@ def _ring(half: Image) -> tuple[Array, Array]:
     return mean, cv2.sqrt(variance, variance)
 
 
-def _signal(image: Image, mean: Array, deviation: Array, of_difference: bool) -> Array:
-    """Contrast of the brightest and darkest pixel of an image in each pixel of the ring's, in its deviations."""
-    height, width = mean.shape
-    side = round(image.shape[1] / width)
-
-    def extreme(of: Callable[..., Image]) -> Image:
-        there = of(image, np.ones((side, side), np.uint8), anchor=(0, 0))
-        return np.ascontiguousarray(there[::side, ::side][:height, :width])
-
-    contrast = cv2.subtract(extreme(cv2.dilate), mean, dtype=cv2.CV_32F)
-    if not of_difference:
-        contrast = cv2.max(contrast, cv2.subtract(mean, extreme(cv2.erode), dtype=cv2.CV_32F))
-    return cv2.divide(contrast, deviation)
-
-
 def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> SmallTarget | None:
     """Find the box of a peak, in the image of a finer scale; None if its outline leaves the ring.
 
@@ -200,20 +204,22 @@ def _outline(levels: Sequence[Image], peak: _Peak, of_difference: bool) -> Small
         peak: the peak.
         of_difference: whether the target is brighter than its surroundings in all its parts, as in a difference.
     """
-    fine = max(0, peak.level - 1 - SCALES)
-    image, factor, unit, around = levels[fine], 2 ** (peak.level - fine), 2**fine, peak.around
-    u, v, reach, margin = factor * peak.u, factor * peak.v, factor * (GUARD_HALF_PX + 1) // 2, factor // 2
-    left, top = max(0, u + margin - reach), max(0, v + margin - reach)
-    window = image[top : v + margin + reach + 1, left : u + margin + reach + 1]
-    i, j = max(0, u - left - margin), max(0, v - top - margin)
-    darkest, brightest, *places = cv2.minMaxLoc(window[j : v - top + factor + margin, i : u - left + factor + margin])
+    scale, around = peak.scale, peak.around
+    fine = max(0, scale - SCALES)
+    image, factor, unit = levels[fine], 2 ** (scale - fine), 2**fine
+    u, v = factor * peak.u + factor // 2, factor * peak.v + factor // 2
+    reach = factor * GUARD_HALF_PX
+    left, top = max(0, u - reach), max(0, v - reach)
+    window = image[top : v + reach + 1, left : u + reach + 1]
+    x, y = max(0, u - left - factor), max(0, v - top - factor)
+    darkest, brightest, *places = cv2.minMaxLoc(window[y : v - top + factor + 1, x : u - left + factor + 1])
     bright = of_difference or brightest - around >= around - darkest
-    contrast, (di, dj) = (brightest if bright else darkest) - around, places[bright]
+    contrast, (i, j) = (brightest if bright else darkest) - around, places[bright]
     # An aeroplane has bright and dark parts.
     off = OUTLINE * abs(contrast)
     least = 0 if of_difference else max(0, math.ceil(around - off))
     beside = cv2.inRange(window, least, math.floor(around + off))
-    x, y, w, h = cv2.floodFill(beside, None, (i + di, j + dj), (1,), flags=8)[3]
+    x, y, w, h = cv2.floodFill(beside, None, (x + i, y + j), (1,), flags=8)[3]
     bottom, right = window.shape
     across = (x == 0 and left > 0) or (x + w == right and left + right < image.shape[1])
     down = (y == 0 and top > 0) or (y + h == bottom and top + bottom < image.shape[0])

@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.detection.base import pieces
-from cotarget.detection.small_target.contrast import OUTLINE, SCALES, SmallTarget
+from cotarget.detection.small_target.contrast import OUTLINE, SmallTarget
 from cotarget.rig import Image
 
 Box = tuple[int, int, int, int]  # left, top, width and height [px]
-# Number of halvings of the image in which regions are found, and of that in which the background is found.
-FINE, COARSE = 1, SCALES
+# Number of halvings of the image in which regions are found, and pixels along a pixel of that of the background.
+FINE, COARSE_PX = 1, 8
 # Least larger side of a region, in parts of the image's width.
 LEAST_PART = 40 / 640
 # Side of the median's window, in parts of the image's width.
@@ -41,10 +41,10 @@ def find_wholes(levels: Sequence[Image], times: int) -> list[SmallTarget]:
         levels: the image and its halvings.
         times: factor from its pixels to those of the regions.
     """
-    if len(levels) <= COARSE:
-        return []
-    grey, fine, small = levels[0], levels[FINE], levels[COARSE]
-    width, unit = grey.shape[1], 2**FINE
+    grey, fine, unit = levels[0], levels[min(FINE, len(levels) - 1)], 2**FINE
+    height, width = grey.shape
+    coarse = (max(1, width // COARSE_PX), max(1, height // COARSE_PX))
+    small = cv2.resize(grey, coarse, interpolation=cv2.INTER_AREA)
     side = 2 * round(WINDOW_PART * small.shape[1] / 2) + 1
     ground = cv2.resize(cv2.blur(cv2.medianBlur(small, side), (5, 5)), fine.shape[::-1], interpolation=cv2.INTER_LINEAR)
     sharp = cv2.absdiff(fine, ground)
