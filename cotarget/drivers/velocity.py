@@ -145,7 +145,7 @@ class SteeredAxis:
             return 0.0
         wanted = min(max(flow + gain * (goal - here), -self._limit), self._limit)
         beyond = abs(goal - position)
-        if not flow and wanted * self._turned < 0 and beyond > self._facts.slack:
+        if not flow and wanted * self._turned < 0 and beyond > self._tolerance:
             self._swings += 1
             if self._swings > SWINGS:
                 self._gain *= CALMER
