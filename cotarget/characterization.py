@@ -269,6 +269,7 @@ def _settled(rig: Rig, unmoved_s: float = UNMOVED_S) -> tuple[Image, bool]:
         stack.append(grey)
         if now - still > (STILL_S if moved else unmoved_s):
             _patiently(rig.head.halt)  # it stands, and its driver may not know that
+            _patiently(rig.head.state)  # that its move did not arrive is no error of what comes next
             return np.mean(stack, axis=0).round().astype(np.uint8), moved
     raise CalibrationError(
         f"the zoom camera's picture does not come to rest within {SLOWEST_S:g} s; point it at something that stands "
@@ -551,13 +552,9 @@ def _turn(rig: Rig, goal: Angles, focal_px: float, phase_s: float, halt_s: float
                 moved, still = True, rig.clock.now()
         if not math.isnan(halted_s) and rig.clock.now() - still > (STILL_S if moved else UNMOVED_S):
             break
-    if not moved:
-        raise CalibrationError(
-            f"the zoom camera's picture does not move where the dome is sent on at {SLOW_DEG_S:g} degrees/s: see that "
-            "nothing else halts it, and that it can turn so slowly"
-        )
     images = [grey for _, grey in frames]
-    angles = _turned(images, focal_px * images[0].shape[1] / rig.zoom.size[0])
+    reduced_px = focal_px * images[0].shape[1] / rig.zoom.size[0]
+    angles = _turned(images, reduced_px) if moved else np.zeros(len(images))
     on_its_way = np.isfinite(angles)
     return _Turn(t, halted_s, np.array([t for t, _ in frames])[on_its_way], angles[on_its_way], states)
 
@@ -617,6 +614,14 @@ def time_turns(rig: Rig, room: Room, focal_px: float, scale: float) -> tuple[flo
     for phase_s, halt_s, side in zip(PHASES_S, itertools.cycle(HALTS_S), itertools.cycle((1, -1)), strict=False):
         _go(rig, _beside(room, -side * SLOW_DEG / 2))
         turns.append(_turn(rig, _beside(room, side * SLOW_DEG / 2), focal_px, phase_s, halt_s))
+    # One that something cut short, such as a frame that came too late for the watchdog, shows nothing.
+    shortest = statistics.median(turn.way for turn in turns) / 2
+    if not shortest:
+        raise CalibrationError(
+            f"the zoom camera's picture does not move where the dome is sent on at {SLOW_DEG_S:g} degrees/s: see that "
+            "nothing else halts it, and that it can turn so slowly"
+        )
+    turns = [turn for turn in turns if turn.way > shortest]
     start, rate = start_of_turns([(turn.times + late - turn.t, turn.angles) for turn in turns])
     longest = scale * math.radians(WHOLE * SLOW_DEG)
     stops = [turn.way / rate - turn.halted_s for turn in turns if turn.way < longest]

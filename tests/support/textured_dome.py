@@ -183,6 +183,7 @@ class _Head:
         if rig.steered:
             for steering, goal, rate in zip(rig.steering, (pan, tilt), self.limits.capped(speed), strict=True):
                 steering.aim(math.degrees(goal), math.degrees(rate), rig.t)
+            rig.steered_t = rig.t
             return pan, tilt
         for axis, goal, k, rate in zip(rig.axes, (pan, tilt), rig.scale, self.limits.capped(speed), strict=True):
             goal = round(goal / step) * step if step else goal
