@@ -43,6 +43,7 @@ Got = TypeVar("Got")
 REDUCED_PX = 640  # larger width of pictures that are compared
 LENS_STANDS_S = 0.8  # longest delay of a picture, after the lens has come to rest [s]
 STILL_PX, STILL_S = 0.25, 0.5  # the picture stands if its corners move by no more from frame to frame for so long
+AWAIT_S = 2.0  # where the head says that it moves, as between two relative moves, its picture has to stand for so long
 UNMOVED_S = 3.0  # a picture that has not moved for so long after a command does not move [s]
 BACK_S = 5.0  # longest time without a frame [s]
 # Speed to places: nobody knows yet whether positions are late; at the highest, half a second is half of the view.
@@ -267,7 +268,10 @@ def _settled(rig: Rig, unmoved_s: float = UNMOVED_S) -> tuple[Image, bool]:
         if _motion(stack[-1], grey) > STILL_PX:
             stack, moved, still = [], True, now
         stack.append(grey)
-        if now - still > (STILL_S if moved else unmoved_s):
+        stands_s = STILL_S if moved else unmoved_s
+        if _patiently(rig.head.state).moving:
+            stands_s = max(stands_s, AWAIT_S)
+        if now - still > stands_s:
             _patiently(rig.head.halt)  # it stands, and its driver may not know that
             _patiently(rig.head.state)  # that its move did not arrive is no error of what comes next
             return np.mean(stack, axis=0).round().astype(np.uint8), moved
@@ -632,11 +636,12 @@ def _report_s(turns: Sequence[_Turn], late: float) -> float | None:
     """Compare the picture with the reports; None where the head reports nothing that moves so."""
     seen, said = list[tuple[Array, Array]](), list[tuple[Array, Array]]()
     for i, turn in enumerate(turns):
-        if any(state.sigma for state in turn.states):  # reckoned from the commands
+        states = [state for state in turn.states if not state.sigma]  # others are reckoned from the commands
+        if len(states) < len(turn.states) / 2:
             return None
         after = APART_S * i - turn.t
-        times, fresh = np.unique([state.t for state in turn.states], return_index=True)
-        ways = np.abs(np.array([state.pan for state in turn.states])[fresh] - turn.states[0].pan)
+        times, fresh = np.unique([state.t for state in states], return_index=True)
+        ways = np.abs(np.array([state.pan for state in states])[fresh] - states[0].pan)
         stands = LONGEST_DELAY + BACK_S  # before the first report, and after the last
         said.append((np.array([times[0] - stands, *times, times[-1] + stands]) + after, np.array([0, *ways, ways[-1]])))
         seen.append((turn.times + after, turn.angles))

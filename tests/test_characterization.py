@@ -49,6 +49,7 @@ def drawn(seed):
         curve=random.uniform(-0.4, 0.4),
         turns_at_zoom=bool(random.integers(2)),
         cap_deg_s=random.uniform(2.0, 20.0),
+        steps=seed % 2 == 0,
     )
 
 

@@ -19,6 +19,7 @@ TEXTURE = (4096, 2048)  # of the whole sphere
 LATENCY_S = 0.15  # from light to arrival; the rig's spec says less
 RATE_HZ = 12.5
 SWING_S = 1.2  # period
+FIRST_STEP, PAUSE_S = 0.8, 0.9  # part of a way, and the time until the rest of it
 STEERED_S = 0.04  # between its positions, by which it is steered
 DEGREES = AxisFacts(
     unit=math.radians(1), lowest=-170, highest=170, fastest=100, step=0.0, slack=0.1, loses_steps=False
@@ -57,6 +58,7 @@ class TexturedDome:
         swing_deg: by which it swings about its goal until it is halted.
         steered: whether it takes velocities, with which a driver leads it to its goal that does not know `late_s`.
         known_s: `stop_s`, as that driver knows it.
+        steps: whether it goes a part of a way, and after a pause the rest, as by relative moves.
     """
 
     seed: int = 0
@@ -75,6 +77,7 @@ class TexturedDome:
     swings: bool = False
     steered: bool = False
     known_s: float = 0.0
+    steps: bool = False
     t: float = 10.0
 
     def __post_init__(self):
@@ -82,6 +85,7 @@ class TexturedDome:
         self.axes = [Axis(math.radians(100), math.radians(800)) for _ in range(2)]
         self.steering = [SteeredAxis(DEGREES, self.delay_s, self.known_s) for _ in range(2)]
         self.steered_t = self.t
+        self.next_step = None  # its time, and goals with speeds
         self.zooms = [(0.0, WIDE_PX)]
         self.sent = (0.0, 0.0)
         self.fixed, self.zoom, self.head, self.clock = _Fixed(self), _Zoom(self), _Head(self), RigClock(self, 1e-3)
@@ -92,7 +96,11 @@ class TexturedDome:
         return WIDE_PX * LONGEST ** (share + self.curve * share * (1 - share))
 
     def steer(self, t):
-        """Send velocities until a time."""
+        """Send velocities, or the next step, until a time."""
+        if self.next_step and self.next_step[0] <= t:
+            for axis, goal in zip(self.axes, self.next_step[1], strict=True):
+                axis.command(self.next_step[0], *goal)
+            self.next_step = None
         while self.steered and self.steered_t <= t:
             now, self.steered_t = self.steered_t, self.steered_t + STEERED_S
             for axis, steering, k in zip(self.axes, self.steering, self.scale, strict=True):
@@ -173,7 +181,7 @@ class _Head:
     def state(self):
         rig = self.rig
         seen = rig.angles(rig.t - rig.late_s) if rig.obeys else rig.sent
-        moving = any(axis.motor(rig.t)[1] != 0 for axis in rig.axes)
+        moving = bool(rig.next_step) or any(axis.motor(rig.t)[1] != 0 for axis in rig.axes)
         return PanTiltState(*(at / k for at, k in zip(seen, rig.scale, strict=True)), moving, rig.t)
 
     def move(self, pan, tilt, speed=None, wait=False):
@@ -185,17 +193,23 @@ class _Head:
                 steering.aim(math.degrees(goal), math.degrees(rate), rig.t)
             rig.steered_t = rig.t
             return pan, tilt
+        rest = []
         for axis, goal, k, rate in zip(rig.axes, (pan, tilt), rig.scale, self.limits.capped(speed), strict=True):
             goal = round(goal / step) * step if step else goal
             if rig.obeys:
                 zoomed = rig.zooms[-1][1] > WIDE_PX * LONGEST**0.5
                 fastest = math.radians(rig.cap_deg_s if zoomed else 100.0)
-                axis.command(rig.t + rig.delay_s, k * goal, min(abs(k) * rate, fastest))
+                rate = min(abs(k) * rate, fastest)
+                here = axis.motor(rig.t)[0] if rig.steps else k * goal
+                stands = axis.command(rig.t + rig.delay_s, here + FIRST_STEP * (k * goal - here), rate)
+                rest.append((stands, k * goal, rate))
+        rig.next_step = (max(rest)[0] + PAUSE_S, [goal for _, *goal in rest]) if rig.steps else None
         return pan, tilt
 
     def halt(self):
         self.rig.swings = False
         self.rig.steer(self.rig.t)
+        self.rig.next_step = None
         for steering in self.rig.steering:
             steering.stop(self.rig.t)
         for axis in self.rig.axes:
