@@ -73,6 +73,9 @@ TILTED = 0.25  # tilt of these turns, as a part of pan: both axes take the same 
 PHASES_S = (0.0, 0.041, 0.013, 0.061, 0.027, 0.087)  # between a frame and their command
 HALTS_S = (0.9, 1.03, 0.97)  # from the command to the halt
 HALTED_S = 1.5  # longest time for which a halted dome turns on, and its driver obeys no move [s]
+# Pictures of a turn are compared with one of it that is no farther than this part of their width: over a quarter of it,
+# tiles and shelves are taken for their neighbours.
+NEAR = 0.05
 BESIDE = 0.05  # of the way of a turn: a picture that seems farther off it was taken for one like it
 WHOLE = 0.95  # part of that way beyond which it was not halted
 ALONE_DEG = 4.0  # way of a move of pan alone
@@ -568,13 +571,18 @@ def _turned(images: Sequence[Image], focal_px: float) -> Array:
 
     Nan for one that was taken for another place like it.
     """
-    base = images[0].astype(np.float32)
-    window = cv2.createHanningWindow(base.shape[::-1], cv2.CV_32F)
-    shifts = np.array([cv2.phaseCorrelate(base, image.astype(np.float32), window)[0] for image in images])
-    end = np.median(shifts[-5:], axis=0)
-    along = shifts @ end / max(float(np.linalg.norm(end)), 1e-9)
-    # What both pictures show is as far from the middle in one as in the other.
-    angles = 2 * np.arctan(along / 2 / focal_px)
+    near, size = images[0].astype(np.float32), images[0].shape[::-1]
+    window = cv2.createHanningWindow(size, cv2.CV_32F)
+    turned, here = [], np.zeros(2)
+    for image in images:
+        shift = np.array(cv2.phaseCorrelate(near, image.astype(np.float32), window)[0])
+        # What both pictures show is as far from the middle in one as in the other.
+        turned.append(here + 2 * np.arctan(shift / 2 / focal_px))
+        if float(np.linalg.norm(shift)) > NEAR * size[0]:
+            near, here = image.astype(np.float32), turned[-1]
+    angles = np.array(turned)
+    end = np.median(angles[-5:], axis=0)
+    angles = angles @ end / max(float(np.linalg.norm(end)), 1e-9)
     return np.where(np.abs(angles / _end(angles) - 0.5) < 0.5 + BESIDE, angles, np.nan)
 
 
@@ -642,9 +650,12 @@ def _report_s(turns: Sequence[_Turn], late: float) -> float | None:
         after = APART_S * i - turn.t
         times, fresh = np.unique([state.t for state in states], return_index=True)
         ways = np.abs(np.array([state.pan for state in states])[fresh] - states[0].pan)
+        if not ways[-1]:
+            return None
         stands = LONGEST_DELAY + BACK_S  # before the first report, and after the last
-        said.append((np.array([times[0] - stands, *times, times[-1] + stands]) + after, np.array([0, *ways, ways[-1]])))
-        seen.append((turn.times + after, turn.angles))
+        parts = np.array([0, *ways, ways[-1]]) / ways[-1]
+        said.append((np.array([times[0] - stands, *times, times[-1] + stands]) + after, parts))
+        seen.append((turn.times + after, turn.angles / turn.way))
     found = delay_between(*map(np.concatenate, zip(*seen, strict=True)), *map(np.concatenate, zip(*said, strict=True)))
     return late + found.seconds if found.agreement >= AGREEMENT else None
 
