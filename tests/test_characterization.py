@@ -97,9 +97,9 @@ def test_a_dome_that_swings_about_its_goal_is_halted_and_measured():
 def test_times_of_a_dome_that_slows_down_long_before_its_goal():
     """As one that is steered by velocities and stops late; its goals in slow turns are 18 degrees away.
 
-    The second turn is refused.
+    It looks at tiles, and the second turn is refused.
     """
-    dome = TexturedDome(steered=True, scale=(-1.2, 1.1), delay_s=0.1, stop_s=1.1, known_s=1.1)
+    dome = TexturedDome(steered=True, scale=(-1.2, 1.1), delay_s=0.1, stop_s=1.1, known_s=1.1, tiles=True)
     rig, move, slow = rig_of(dome), dome.head.move, []
 
     def refuse_second(pan, tilt, speed=None, wait=False):

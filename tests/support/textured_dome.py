@@ -38,6 +38,13 @@ def texture(seed):
     return np.clip(128 + 40 * levels / levels.std(), 0, 255).astype(np.uint8)
 
 
+def tiled(structure):
+    """Make a picture one of equal tiles, 12 degrees wide, of which each is a little different."""
+    width = round(12.0 / 360.0 * TEXTURE[0])
+    tiles = np.tile(structure[:, :width], (1, TEXTURE[0] // width + 1))[:, : TEXTURE[0]]
+    return cv2.addWeighted(tiles, 0.8, structure, 0.2, 0.0)
+
+
 @dataclass
 class TexturedDome:
     """All devices are views of one object whose time moves only when somebody waits for a frame.
@@ -58,6 +65,7 @@ class TexturedDome:
         swing_deg: by which it swings about its goal until it is halted.
         steered: whether it takes velocities, with which a driver leads it to its goal that does not know `late_s`.
         known_s: `stop_s`, as that driver knows it.
+        tiles: whether what it sees is made of tiles.
         steps: whether it goes a part of a way, and after a pause the rest, as by relative moves.
     """
 
@@ -77,11 +85,12 @@ class TexturedDome:
     swings: bool = False
     steered: bool = False
     known_s: float = 0.0
+    tiles: bool = False
     steps: bool = False
     t: float = 10.0
 
     def __post_init__(self):
-        self._texture = texture(self.seed)
+        self._texture = tiled(texture(self.seed)) if self.tiles else texture(self.seed)
         self.axes = [Axis(math.radians(100), math.radians(800)) for _ in range(2)]
         self.steering = [SteeredAxis(DEGREES, self.delay_s, self.known_s) for _ in range(2)]
         self.steered_t = self.t
