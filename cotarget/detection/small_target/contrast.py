@@ -3,9 +3,9 @@
 This is a constant false alarm rate detector (Rohling 1983) in two dimensions.
 """
 
+import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
@@ -38,8 +38,7 @@ OUTLINE = 0.33
 TEXTURE_PX = (5, 5)
 
 
-@dataclass(frozen=True)
-class SmallTarget:
+class SmallTarget(NamedTuple):
     """A small region that stands out from its surroundings.
 
     Attributes:
@@ -101,7 +100,7 @@ def find_small_targets(
     if of_difference or coarsest not in scales:  # a small image is not searched at all scales
         return kept
     texture = cv2.absdiff(levels[coarsest], cv2.blur(levels[coarsest], TEXTURE_PX))
-    return [replace(target, beside=_beside(texture, target, 2**coarsest)) for target in kept]
+    return [target._replace(beside=_beside(texture, target, 2**coarsest)) for target in kept]
 
 
 def _contains(target: SmallTarget, at: tuple[float, float]) -> bool:
@@ -157,15 +156,14 @@ def _peaks(levels: Sequence[Image], scale: int, threshold: float, finest: bool, 
             # Linear interpolation halfway between pixels is the mean of 2x2 px, at a third of blur's time.
             dark = bright = cv2.getRectSubPix(level, size, (width / 2 - 1, height / 2 - 1))
         searched.append((dark, bright, rougher))
-    off: Image | None = None  # by how much each pixel stands out beyond the threshold
+    beyond = []  # by how much each pixel stands out beyond the threshold
     for dark, bright, roughness in searched:
         # In bytes, which is three times as fast; half a grey level is little beside the threshold.
         margin = roughness * np.float32(threshold)
-        sides = [cv2.subtract(bright, cv2.resize(cv2.add(mean, margin, dtype=cv2.CV_8U), size))]
+        beyond.append(cv2.subtract(bright, cv2.resize(cv2.add(mean, margin, dtype=cv2.CV_8U), size)))
         if not of_difference:
-            sides.append(cv2.subtract(cv2.resize(cv2.subtract(mean, margin, dtype=cv2.CV_8U), size), dark))
-        for side in sides:
-            off = side if off is None else cv2.max(off, side, off)
+            beyond.append(cv2.subtract(cv2.resize(cv2.subtract(mean, margin, dtype=cv2.CV_8U), size), dark))
+    off = functools.reduce(cv2.max, beyond)
     peaks = []
     for contour in cv2.findContours(cv2.compare(off, 0, cv2.CMP_GT), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
         x, y, w, h = cv2.boundingRect(contour)

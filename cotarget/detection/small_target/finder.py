@@ -109,7 +109,7 @@ class SmallTargetFinder:
             low = target.low[0] // unit, target.low[1] // unit
             size = -(-target.size[0] // unit), -(-target.size[1] // unit)
             since = changes(grey, low, size, target.around, self._history.noise, references)
-            target = replace(target, since=tuple(since))
+            target = target._replace(since=tuple(since))
             score = small_target_score(target.signal, since, target.beside, self._weights)
             detection = _boxed(target, score, shape, times)
             if detection.score >= self._least_score:
@@ -172,8 +172,8 @@ class SmallTargetFinder:
         for target in find_small_targets([unusual[top:bottom, left:right]], LEAST_DIFFERENCE, of_difference=True):
             score = float(1 / (1 + (EVEN_DIFFERENCE / target.signal) ** self._weights[0]))
             (x, y), (w, h) = target.low, target.size
-            target = replace(
-                target, low=(pixel * (left + x), pixel * (top + y)), size=(pixel * w, pixel * h), beside=math.inf
+            target = target._replace(
+                low=(pixel * (left + x), pixel * (top + y)), size=(pixel * w, pixel * h), beside=math.inf
             )
             found.append((target, _boxed(target, score, (unit * grey.shape[0], unit * grey.shape[1]), times)))
         return found

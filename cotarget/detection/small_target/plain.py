@@ -41,7 +41,9 @@ def find_wholes(levels: Sequence[Image], times: int) -> list[SmallTarget]:
         levels: the image and its halvings.
         times: factor from its pixels to those of the regions.
     """
-    grey, fine, unit = levels[0], levels[min(FINE, len(levels) - 1)], 2**FINE
+    if len(levels) <= FINE:
+        return []
+    grey, fine, unit = levels[0], levels[FINE], 2**FINE
     height, width = grey.shape
     coarse = (max(1, width // COARSE_PX), max(1, height // COARSE_PX))
     small = cv2.resize(grey, coarse, interpolation=cv2.INTER_AREA)
