@@ -23,8 +23,6 @@ OVERSAMPLING = 4
 BLUR_PX = 1.2
 # Steps of the numerical derivatives: u, v, width, height [px] and turn [rad]; small against the blur.
 DERIVATIVE = np.array([0.1, 0.1, 0.1, 0.1, 0.02])
-# Largest change in one iteration, in the same units: the linearisation holds within the blur.
-LARGEST_STEP = np.array([1.0, 1.0, 1.0, 1.0, 0.1])
 ITERATIONS = 12
 # Largest change of a parameter after convergence [px, rad].
 CONVERGED = 0.01
@@ -69,7 +67,7 @@ def fit_template(
         prior = np.zeros(9)
         prior[4] = noise / TURN_SIGMA
         step = np.linalg.lstsq(np.vstack([J, prior]), np.append(residual, -prior[4] * pose[4]), rcond=None)[0][:5]
-        pose = pose + np.clip(step, -LARGEST_STEP, LARGEST_STEP)
+        pose = pose + np.clip(step, -BLUR_PX, BLUR_PX)  # the linearisation holds within the blur
         if (pose[2:4] > size * LARGEST_CHANGE).any() or (pose[2:4] < size / LARGEST_CHANGE).any():
             return None
         if np.abs(step).max() < CONVERGED:

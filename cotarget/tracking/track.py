@@ -71,8 +71,6 @@ LARGEST_AREA_RATIO = 10.0
 BEAT_S = 0.5
 # Quantile of a side that counts as its maximum, robust against one wrong frame in ten.
 BEAT_PART = 0.9
-# Window of the whole [s]: a drone or a bird may be seen in pieces for a second.
-WHOLE_S = 2.0
 # Largest part of the travel in one step; beyond it the outline jumped to that of another thing.
 LARGEST_STEP = 2 / 3
 Edges = tuple[float, float]
@@ -102,14 +100,15 @@ class SizeHistory:
         larger_side: largest of the larger sides over a wing beat [px].
     """
 
-    def __init__(self, span_s: float, trend: bool = False) -> None:
+    def __init__(self, span_s: float, trend: bool = False, kept_s: float = 0.0) -> None:
         """Create a history without boxes.
 
         Args:
             span_s: window of the usual size [s], at least a wing beat.
             trend: whether the newest count more where the target grows or shrinks.
+            kept_s: longest window of the whole, see `whole` [s].
         """
-        self._span_s, self._trend = span_s, trend
+        self._span_s, self._trend, self._kept_s = span_s, trend, max(span_s, kept_s)
         self._boxes: deque[tuple[float, tuple[float, float], bool]] = deque()  # time, size, whether it is clipped
         self.size: Array = np.zeros(2)
         self.larger_side = 0.0
@@ -137,7 +136,7 @@ class SizeHistory:
     def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
         """Add a box, see `Trail.add`, and update the sizes."""
         self._boxes.append((t, size, clipped))
-        while self._boxes[0][0] < t - max(self._span_s, WHOLE_S):
+        while self._boxes[0][0] < t - self._kept_s:
             self._boxes.popleft()
         self._update()
 
@@ -282,7 +281,7 @@ class TrackingSettings:
         confirm_hits: fewest detections of a confirmed track.
         confirm_travel: least travel of a confirmed track, in larger sides of its box; 0 if it may stand still.
         least_travel: least travel of a confirmed track, in parts of the image's width.
-        travel_s: window of that travel [s].
+        travel_s: window of that travel, and of the whole of what flies, of which pieces are seen for a second [s].
         confirm_score: least average score of a confirmed track, the last detections weighted most; 0 for any. With
             `confirm_travel` too, half of it is enough for a track that has travelled.
         start_score: a detection with a lower score neither begins nor prolongs a track; a confirmed one follows it for
@@ -440,7 +439,7 @@ class LiveTrack:
         self.expected = False  # whether the place in this frame is known from elsewhere
         self._image_size = image_size
         self.mean_score = 0.0
-        self._sizes = SizeHistory(settings.size_s, settings.trend)
+        self._sizes = SizeHistory(settings.size_s, settings.trend, settings.travel_s)
         # Travel is needed until the track is confirmed, and only if the settings ask for it.
         self._trail = Trail(settings.travel_s, image_size) if settings.confirm_travel else None
         self._shift = (0.0, 0.0)  # of the scene since the first detection [px]
@@ -469,7 +468,7 @@ class LiveTrack:
     @property
     def whole(self) -> Array:
         """Width and height of the whole target, of which a piece may be seen now [px], (2,)."""
-        return self._sizes.whole(WHOLE_S)
+        return self._sizes.whole(self.settings.travel_s)
 
     def predict(self, t: float) -> None:
         """Predict the track at time ``t`` [s]."""

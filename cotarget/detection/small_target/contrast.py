@@ -84,7 +84,9 @@ def find_small_targets(
     """
     coarsest = first + SCALES - 1
     levels = pyramid(images, coarsest + 2)
-    scales = [n for n in range(first, coarsest + 1) if min(levels[n].shape) >= 2 * OUTER_HALF_PX]
+    scales = [
+        n for n, level in enumerate(levels[: coarsest + 1]) if n >= first and min(level.shape) >= 2 * OUTER_HALF_PX
+    ]
     peaks = [peak for scale in scales for peak in _peaks(levels, scale, threshold, scale == first, of_difference)]
     peaks.sort(key=lambda peak: -peak.signal)
     kept: list[SmallTarget] = []

@@ -38,6 +38,8 @@ ARRIVED = 0.5
 # Least signal in the difference from all earlier images, and the signal with a score of 0.5. In the simulated field,
 # swaying foliage is above the latter once in six frames, anywhere; a bird in front of it in nineteen of twenty.
 LEAST_DIFFERENCE, EVEN_DIFFERENCE = 7.0, 12.0
+# Fewest of the AGES_S for which there must be an image.
+FEWEST_EARLIER = 3
 # Shift of the camera between two images up to which they are subtracted [px].
 SHAKING_PX = 5.0
 # Usual difference, such as of a swaying branch, subtracted from the difference: its factor, the time constant of its
@@ -136,13 +138,13 @@ class SmallTargetFinder:
         times: int,
         references: Sequence[Reference | None],
     ) -> list[Found]:
-        """Find regions in the difference from earlier images of all AGES_S, if the camera hardly moved.
+        """Find regions in the difference from all earlier images, if there are enough and the camera hardly moved.
 
         The difference of an image enlarged by a factor ``times`` is halved: a twig sways over more of its pixels.
         """
         earlier = [kept for kept in references if kept is not None]
         shifts = [max(map(abs, kept.shift)) for kept in earlier]
-        if len(earlier) < len(AGES_S) or max(shifts) > times * SHAKING_PX:
+        if len(earlier) < FEWEST_EARLIER or max(shifts) > times * SHAKING_PX:
             self._usual = None
             return []
         registered = (
