@@ -18,8 +18,9 @@ AGES_S = (0.07, 0.17, 0.5, 1.0)
 AGE_TOLERANCE = 0.5
 # Least time between two kept images [s].
 SPACING_S = 0.03
-# How far the best match is searched; beyond it a target has moved [px].
-SEARCH_PX = 1
+# Search for the best match: this many pixels if the camera stands; plus this part of its shift, for parallax and
+# distortion; at most this many, beyond which a target has moved [px].
+SEARCH_PX, SEARCH_PART, MOST_SEARCH_PX = 1, 0.05, 4
 # Margin around the target's box that is compared as well [px].
 MARGIN_PX = 2
 # Least noise, from coding and quantisation, where nothing happens [grey levels].
@@ -35,10 +36,12 @@ class Reference:
     Attributes:
         image: the image, (H, W).
         shift: shift of the scene from now to then (du, dv) [px].
+        search: how far a match is searched [px].
     """
 
     image: Image
     shift: tuple[float, float]
+    search: int
 
 
 class History:
@@ -114,7 +117,8 @@ class History:
                 continue
             _, image, shift_then, _ = self._kept[int(off.argmin())]
             du, dv = (shift_then - shift).tolist()
-            found.append(Reference(image, (du, dv)))
+            search = min(MOST_SEARCH_PX, SEARCH_PX + round(SEARCH_PART * math.hypot(du, dv)))
+            found.append(Reference(image, (du, dv), search))
         return found
 
 
@@ -149,22 +153,23 @@ def changes(
     level, variance = _level(now), noise**2 * w * h
     energy = float(np.square(now - np.float32(around)).sum()) + variance
     found = [math.nan if before is None else 0.0 for before in references]
-    patches, ages = [], []
-    size = (w + 2 * SEARCH_PX, h + 2 * SEARCH_PX)
+    most = max((before.search for before in references if before is not None), default=0)
+    size, patches = (w + 2 * most, h + 2 * most), []
     for age, before in enumerate(references):
         if before is None:
             continue
         x, y = left + before.shift[0], top + before.shift[1]
         if -0.5 <= x <= grey.shape[1] - w + 0.5 and -0.5 <= y <= grey.shape[0] - h + 0.5:
             # getRectSubPix takes the centre of a patch: n pixels from column x are centred at x + (n - 1) / 2.
-            center = (x + (w - 1) / 2, y + (h - 1) / 2)
+            center, rim = (x + (w - 1) / 2, y + (h - 1) / 2), most - before.search
             then = cv2.getRectSubPix(before.image, size, center, patchType=cv2.CV_32F)
-            patches.append(then + np.float32(level - _level(then)))  # flickering light is no change
-            ages.append(age)
+            near = then[rim : size[1] - rim, rim : size[0] - rim]
+            patches.append((age, rim, then + np.float32(level - _level(near))))  # flickering light is no change
     if patches:  # all ages at once, because for small patches a call takes longer than its arithmetic
-        squared = cv2.matchTemplate(cv2.hconcat(patches), now, cv2.TM_SQDIFF)
-        for i, age in enumerate(ages):
-            least = _least(squared[:, i * size[0] : i * size[0] + 2 * SEARCH_PX + 1])
+        squared = cv2.matchTemplate(cv2.hconcat([then for *_, then in patches]), now, cv2.TM_SQDIFF)
+        for first, (age, rim, _) in zip(range(0, squared.shape[1], size[0]), patches, strict=True):
+            end = 2 * most + 1 - rim
+            least = _least(squared[rim:end, first + rim : first + end])
             found[age] = max(0.0, least - 2 * variance) / energy
     return found
 

@@ -30,6 +30,8 @@ FAINTEST = 0.15
 # Least difference from its own surroundings of what reaches farther from a region than its blurred edge, over the
 # region's largest difference: rotors; and the width of that edge [px].
 FAINT, BLUR_PX = 0.06, 3
+# Gap that is closed within a region, in pixels of the image in which they are found.
+GAP_PX = 5
 # Pixels, about, in which a region and its surroundings are sampled.
 SAMPLES = 1000
 
@@ -54,7 +56,7 @@ def find_wholes(levels: Sequence[Image], times: int) -> list[SmallTarget]:
     below = np.cumsum(cv2.calcHist([off], [0], None, [256], [0, 256]))  # a seventh of the time of np.median
     usual = max(float(np.searchsorted(below, off.size / 2)), 1.0)
     mask = cv2.compare(off, TIMES * usual, cv2.CMP_GT)
-    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, None)
+    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
     found = []
     boxes = cv2.connectedComponentsWithStats(mask, ltype=cv2.CV_16U)[2][1:, :4]  # the first is the background
     for x, y, w, h in boxes[unit * boxes[:, 2:].max(axis=1) >= LEAST_PART * width].tolist():
