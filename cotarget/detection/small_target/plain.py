@@ -22,8 +22,8 @@ FINE, COARSE_PX = 1, 8
 LEAST_PART = 40 / 640
 # Side of the median's window, in parts of the image's width.
 WINDOW_PART = 0.5
-# Least difference from the background, in usual differences, which are a grey level at least.
-TIMES = 4.0
+# Least difference from the background: in usual differences, and in grey levels.
+TIMES, LEAST_LEVELS = 4.0, 3.0
 # Least difference of a region's parts, over its largest one. If anything beside it differs by more, it is no whole: a
 # person's coat before a wall has legs and head beside it.
 FAINTEST = 0.15
@@ -54,7 +54,7 @@ def find_wholes(levels: Sequence[Image], times: int) -> list[SmallTarget]:
     sharp = cv2.absdiff(fine, ground)
     off = cv2.blur(sharp, (3, 3))
     below = np.cumsum(cv2.calcHist([off], [0], None, [256], [0, 256]))  # a seventh of the time of np.median
-    usual = max(float(np.searchsorted(below, off.size / 2)), 1.0)
+    usual = max(float(np.searchsorted(below, off.size / 2)), LEAST_LEVELS / TIMES)
     mask = cv2.compare(off, TIMES * usual, cv2.CMP_GT)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
     found = []
@@ -97,7 +97,7 @@ def _outline(grey: Image, box: Box, unit: int, contrast: float) -> Box:
     inside = x - left, y - top, w, h
     plane, usual = _surroundings(window, inside, reach / 2)
     off = cv2.absdiff(window, plane)
-    least = unit * TIMES * usual
+    least = unit * max(TIMES * usual, LEAST_LEVELS)
     masks = (cv2.compare(off, max(least, part * contrast), cv2.CMP_GT) for part in (OUTLINE, FAINT))
     core, whole = (_edges(mask, inside) for mask in masks)
     if core is None or whole is None:
@@ -125,8 +125,8 @@ def _surroundings(window: Image, box: Box, near: float) -> tuple[Image, float]:
     for _ in range(2):  # the second time without what stands out
         fit = np.linalg.lstsq(places, levels, rcond=None)[0]
         off = np.abs(places @ fit - levels)
-        usual = max(float(np.median(off)), 1.0)
-        plain = off <= TIMES * usual
+        usual = float(np.median(off))
+        plain = off <= max(TIMES * usual, LEAST_LEVELS)
         places, levels = places[plain], levels[plain]
     rows, columns = (np.arange(n, dtype=np.float32) for n in window.shape)
     a, b, c = fit.astype(np.float32)
