@@ -28,7 +28,9 @@ from cotarget.config import RigConfig, parse_config
 from cotarget.emulators.emulation import Emulation
 from cotarget.emulators.onvif import lens_table
 from cotarget.emulators.world import paced
+from cotarget.errors import DeviceError
 from cotarget.files import write_atomically
+from cotarget.rig import Rig
 from cotarget.sim.world import SimWorld
 from experiments.engine import Row
 from experiments.wire.follow import PASSWORD, USER
@@ -209,12 +211,20 @@ def _true_delay(file: Path, config: RigConfig, start: float, pipe: Connection) -
             way = math.radians(AT_ONCE_DEG) * (1 - i % 2)
             rig.head.move(state.pan + way, state.tilt + way / 4)
             # A head that is still on its way gets commands without a call. The watchdog wants its frames to be read.
-            while rig.head.state().moving and rig.clock.now() < LONGEST_MOVE_S + called[-1]:
+            while _moving(rig) and rig.clock.now() < LONGEST_MOVE_S + called[-1]:
                 frame = rig.zoom.read(newer_than=frame.t)
         pipe.send("end")
         moved = pipe.recv()
     transits = [next((t for t in moved if t >= call), math.nan) - call for call in called]
     return float(np.median(late) + np.nanmedian(transits)) + config.sim.head.command_delay_s
+
+
+def _moving(rig: Rig) -> bool:
+    """Return whether the head moves; one that did not arrive in time was halted."""
+    try:
+        return rig.head.state().moving
+    except DeviceError:
+        return False
 
 
 def _emulate(pipe: Connection, seed: int, facts: Facts) -> None:
