@@ -134,7 +134,9 @@ def read_object(path: Path, wanted: str) -> Table:
         raise CalibrationError(f"{path}: no such file; {wanted}") from None
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except UnicodeDecodeError:
+        raise CalibrationError(f"{path}: is not UTF-8 text; {wanted}") from None
+    except (json.JSONDecodeError, RecursionError) as error:
         raise CalibrationError(f"{path}: is not JSON: {error}; {wanted}") from None
     if not isinstance(table, dict):
         raise CalibrationError(f"{path}: holds no JSON object; {wanted}")

@@ -299,9 +299,10 @@ class TrackingSettings:
             target than a new object, because after 0.8 s the gate reaches over 250 px. Real films of birds and people
             have up to 4 a second; below 1, tracks jump to other targets, and from 8 on, hidden birds are not found
             again.
+        overlap_enough: overlap from which a box may belong to a track even outside the gate: the target merged with
+            something else, or stopped.
         covered: a detection that covers this part of a track's predicted box explains the track, even if another has
-            won it, but not if it is much larger and the track has just been found. With an overlap of it, a box may
-            belong to a track even outside the gate: the target merged with something else.
+            won it, but not if it is much larger and the track has just been found.
         most_detections: most detections of a frame that are used: snow, rain or flicker must not delay the next frame.
             Real films of birds and of a dozen people have up to 10.
     """
@@ -325,6 +326,7 @@ class TrackingSettings:
     gate: float = 16.3
     size_sigma: float = 0.5
     newcomers_hz: float = 2.0
+    overlap_enough: float = 0.3
     covered: float = 0.5
     most_detections: int = 100
 

@@ -220,7 +220,7 @@ class _Pairs:
         new_object = self.distance + self.log_volume > _least_likely(states, image_size, clutter)
         new_object |= weak & ~np.array(self.confirmed)[:, None]
         # A target whose box merged with another still overlaps its track.
-        self.possible = ((self.distance <= settings.gate) & ~new_object) | (overlap > settings.covered)
+        self.possible = ((self.distance <= settings.gate) & ~new_object) | (overlap > settings.overlap_enough)
         self.possible &= ~known | (self.area_ratio < LARGEST_AREA_RATIO)  # a clipped box has an unknown area
 
 
