@@ -97,7 +97,7 @@ QUICK = dataclasses.replace(
     seeds=1,
     seconds=8.0,
     calibrated=False,
-    targets=("person", "bird"),
+    targets=("person",),
     rates_hz=(10.0,),
     ways=(OURS, ORACLE),
 )
