@@ -23,6 +23,7 @@ import numpy as np
 import tomli_w
 
 from cotarget.backends import open_rig
+from cotarget.characterization import SLOW_DEG_S
 from cotarget.cli.emulate import RENDER_THREADS, SWITCH_S
 from cotarget.config import RigConfig, parse_config
 from cotarget.emulators.emulation import Emulation
@@ -41,7 +42,6 @@ LONGEST_S = 600.0  # a command that takes longer is given up [s]
 MOST_TIMES = 2  # that the command is run
 AGAIN = "again"  # in the words of the command, where a second time would find more
 STOPS_S = {"": 0.0, "slow-stop": 0.4, "slower-stop": 1.1}
-SLOW_DEG_S = 6.0  # speed of the turns whose start is timed
 MOVES, FRAMES = 8, 40  # by which the true delays are measured
 AT_ONCE_DEG = 2.0
 LONGEST_MOVE_S = 20.0  # for the head to stand after each of these moves

@@ -100,8 +100,9 @@ class CameraMotion:
         # A large target may have more corners than the scene, but the scene extends over more of the image. So may
         # leaves or letters that stand in a shaken image, but they are few.
         fewest = FEWEST_ALIKE * kept.sum()
-        spreads = (_spread(self._corners[each], before) for each in (alike, standing))
-        if standing.sum() >= fewest and next(spreads) < next(spreads):
+        if standing.sum() >= fewest and (
+            _spread(self._corners[standing], before) > _spread(self._corners[alike], before)
+        ):
             alike = standing
         if kept.mean() < FEWEST_ALIKE or alike.sum() < fewest:
             as_before = kept & _alike(flow, np.zeros(2)) & (error.ravel() < SAME_PLACE)
