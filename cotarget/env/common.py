@@ -374,9 +374,6 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
 
     def close(self) -> None:
         """Release everything; may be called again."""
-        for pictures in self._opened.values():
-            pictures.close()
-        self._opened.clear()
         self._end()
 
     def _begin(self, seed: int | None, options: Mapping[str, Any] | None) -> int:
@@ -391,12 +388,10 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         return int(self.np_random.integers(2**31))
 
     def _open(self, paths: Mapping[str, tuple[Waypoint, ...]], seed: int) -> Episode:
-        """Open an episode with targets on given paths, reusing the renderers of the previous one."""
+        """Open an episode with targets on given paths."""
         self._end()
         sim = replace(self.config.sim, seed=seed, targets=tuple(paths), paths=paths)
         self._episode = self._made(replace(self.config, sim=sim))
-        for size, before in self._opened.items():
-            self._opened[size] = self._episode.world.pictures(size, before)
         return self._episode
 
     def _made(self, config: RigConfig) -> Episode:
@@ -405,6 +400,8 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
 
     def _end(self) -> None:
         """Close the episode, if there is one."""
+        while self._opened:
+            self._opened.popitem()[1].close()
         if self._episode is not None:
             self._episode.rig.close()
             self._episode = None

@@ -127,15 +127,13 @@ class SimWorld:
         """Render the image of a lens at time t [s] without sensor effects, BGR."""
         return self._views().exposed(camera, lambda _: lens, t, exposure=0.0)
 
-    def pictures(self, size: tuple[int, int], before: SizedPictures | None = None) -> SizedPictures:
+    def pictures(self, size: tuple[int, int]) -> SizedPictures:
         """Open a renderer of both cameras at another size; the caller closes it.
 
         Args:
             size: (width, height) of each picture [px].
-            before: renderer of an earlier world, with the same size. It ends, and its OpenGL context is used again
-                where possible, which saves the time of opening one.
         """
-        return SizedPictures(self.config.sim, self._model, self._state, self._lens_at, self._lenses(), size, before)
+        return SizedPictures(self.config.sim, self._model, self._state, self._lens_at, self._lenses(), size)
 
     def portrait(self, azimuth_deg: float, axes: bool) -> Portrait:
         """Render the rig itself as it is now.

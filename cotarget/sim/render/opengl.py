@@ -3,9 +3,11 @@
 Import ``mujoco`` from this module before anything renders: it sets MUJOCO_GL, which mujoco reads when it is imported.
 """
 
+import atexit
 import ctypes.util
 import os
 import sys
+import threading
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,6 +24,7 @@ INSTALL = {
     "osmesa": "install it: apt-get install -y libosmesa6, or unset MUJOCO_GL",
 }
 OTHERWISE = "unset MUJOCO_GL to render without a screen"
+KEPT = 2  # renderers that a thread keeps after they were closed: an environment may have pictures of two sizes
 # Environment variable: a file that grows by one byte with each picture drawn, in any process. It also counts the
 # pictures of processes that are killed.
 TALLY = "COTARGET_TALLY"
@@ -89,6 +92,43 @@ def _first_process() -> int:
     return os.getpid()
 
 
+class _Kept(threading.local):
+    """Closed renderers of a thread, the newest last; to open OpenGL with all textures takes a fifth of a second."""
+
+    def __init__(self) -> None:
+        self._renderers: list[tuple[tuple[object, ...], Any]] = []
+
+    def add(self, renderer: Any, uploaded: tuple[object, ...]) -> None:
+        """Keep a renderer, which has uploaded these parts of its model; the oldest is closed if there are too many."""
+        self._renderers.append((uploaded, renderer))
+        if len(self._renderers) > KEPT:
+            self._renderers.pop(0)[1].close()
+
+    def take(self, model: "mujoco.MjModel", uploaded: tuple[object, ...]) -> Any:
+        """Take a renderer out whose model differs in mesh vertices at most, and turn it to this one; None without."""
+        if _first_process() != os.getpid():
+            return None
+        for each in self._renderers:
+            parts, renderer = each
+            if parts == uploaded and np.array_equal(renderer._model.tex_data, model.tex_data):
+                self._renderers.remove(each)
+                renderer._model = model
+                _make_current(renderer)
+                for mesh in range(model.nmesh):
+                    mujoco.mjr_uploadMesh(model, renderer._mjr_context, mesh)
+                return renderer
+        return None
+
+    def close(self) -> None:
+        """Close all."""
+        while self._renderers:
+            self._renderers.pop()[1].close()
+
+
+_kept = _Kept()
+atexit.register(_kept.close)
+
+
 class Canvas:
     """Offscreen renderer that draws a pinhole view, or a part of one, of any size up to its own.
 
@@ -100,7 +140,7 @@ class Canvas:
     drawn: ClassVar[float] = 0.0
 
     def __init__(self, model: "mujoco.MjModel", size: tuple[int, int], shadows: bool) -> None:
-        """Open OpenGL on this thread.
+        """Open OpenGL on this thread, or go on with what a closed canvas had opened for a model that looks the same.
 
         Args:
             model: compiled model to draw.
@@ -110,8 +150,9 @@ class Canvas:
         Raises:
             DeviceError: the machine has no suitable OpenGL.
         """
-        self._model, self._uploaded_parts = model, _uploaded_parts(model)
-        self._renderer: Any = make_renderer(model, *size)
+        self._thread = threading.get_ident()
+        self._uploaded = (size, *_uploaded_parts(model))
+        self._renderer: Any = _kept.take(model, self._uploaded) or make_renderer(model, *size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:], self._option.geomgroup[1:] = 0, 0
@@ -120,24 +161,6 @@ class Canvas:
         # MuJoCo resolves samples into a second buffer, which has one sample a pixel.
         self._buffers = {True: context.offFBO, False: context.offFBO_r if self.samples else context.offFBO}
         self._pixels = np.empty(3 * context.offWidth * context.offHeight, dtype=np.uint8)
-
-    def turn_to(self, model: "mujoco.MjModel") -> bool:
-        """Draw another model from now on, if it differs from the current one in mesh vertices at most.
-
-        Opening OpenGL again with all textures takes some hundred times as long.
-
-        Returns:
-            Whether the model was accepted; otherwise nothing changes.
-        """
-        parts = _uploaded_parts(model)
-        if parts != self._uploaded_parts or not np.array_equal(model.tex_data, self._model.tex_data):
-            return False
-        renderer, self._model = self._renderer, model
-        renderer._model = model
-        self._make_current()
-        for mesh in range(model.nmesh):
-            mujoco.mjr_uploadMesh(model, renderer._mjr_context, mesh)
-        return True
 
     def look(self, data: "mujoco.MjData", camera_id: int) -> None:
         """Load the geoms of group 0 in their current poses, from the camera of the model with this id."""
@@ -171,7 +194,7 @@ class Canvas:
         rect = mujoco.MjrRect(0, 0, *size)
         image = self._pixels[: 3 * size[0] * size[1]].reshape(size[1], size[0], 3)
         # mujoco.Renderer draws whole pictures of its own size only.
-        self._make_current()
+        _make_current(renderer)
         context = renderer._mjr_context
         context.offFBO, context.offSamples = self._buffers[multisampled], self.samples * multisampled
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
@@ -185,12 +208,21 @@ class Canvas:
         return image[::-1]  # OpenGL's rows begin at the bottom
 
     def close(self) -> None:
-        """Release OpenGL; safe to call more than once."""
-        self._renderer.close()
+        """Release OpenGL, or keep it for this thread's next canvas; safe to call more than once."""
+        renderer, self._renderer = self._renderer, None
+        if renderer is None:
+            return
+        if threading.get_ident() != self._thread:
+            renderer.close()
+            return
+        context = renderer._mjr_context
+        context.offFBO, context.offSamples = self._buffers[True], self.samples
+        _kept.add(renderer, self._uploaded)
 
-    def _make_current(self) -> None:
-        if self._renderer._gl_context:
-            self._renderer._gl_context.make_current()
+
+def _make_current(renderer: Any) -> None:
+    if renderer._gl_context:
+        renderer._gl_context.make_current()
 
 
 def _uploaded_parts(model: "mujoco.MjModel") -> tuple[object, ...]:

@@ -13,7 +13,7 @@ from cotarget.config import SimConfig
 from cotarget.geometry import Array
 from cotarget.rig import Image
 from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, PORTRAIT_SIZE, RIG, RIG_GROUP
-from cotarget.sim.render.opengl import Canvas, make_renderer, mujoco
+from cotarget.sim.render.opengl import make_renderer, mujoco
 from cotarget.sim.render.optics import TrueLens, covering_size
 from cotarget.sim.render.sensor import Sensor
 from cotarget.sim.render.views import Views
@@ -34,7 +34,6 @@ class SizedPictures:
         lens_at: Callable[[CameraName, float], TrueLens],
         lenses: Sequence[TrueLens],
         size: tuple[int, int],
-        before: "SizedPictures | None" = None,
     ) -> None:
         """Open OpenGL.
 
@@ -45,8 +44,6 @@ class SizedPictures:
             lens_at: gives a camera's true optics at a time, for its stream's size.
             lenses: all lenses that may occur.
             size: (width, height) of the pictures [px].
-            before: renderer of another world, with the same size. It ends, and its OpenGL context is used again where
-                possible.
 
         Raises:
             DeviceError: the machine cannot render.
@@ -55,8 +52,7 @@ class SizedPictures:
         self._cameras, self._blurs = {"fixed": sim.fixed, "zoom": sim.zoom}, sim.effects.blur
         largest = covering_size([_resized(lens, size) for lens in lenses], size)
         model.vis.global_.offwidth, model.vis.global_.offheight = largest
-        canvas = None if before is None else before.hand_over(model)
-        self._views = Views(model, state, largest, sim.effects.shadows, canvas, soft=False)
+        self._views = Views(model, state, largest, sim.effects.shadows, soft=False)
         self._sensors = {
             name: Sensor(replace(camera, size=size), sim.effects, (sim.seed, NOISE[name]))
             for name, camera in self._cameras.items()
@@ -68,13 +64,6 @@ class SizedPictures:
         exposure = camera.exposure_s if self._blurs else 0.0
         image = self._views.exposed(name, lambda when: _resized(self._lens_at(name, when), self._size), t, exposure)
         return self._sensors[name].expose(image, round(t * camera.rate_hz))
-
-    def hand_over(self, model: "mujoco.MjModel") -> Canvas | None:
-        """Hand the canvas to another model, and end this renderer; None where the canvas cannot draw the model."""
-        if self._views.canvas.turn_to(model):
-            return self._views.canvas
-        self.close()
-        return None
 
     def close(self) -> None:
         """Release OpenGL; safe to call more than once."""

@@ -109,7 +109,6 @@ class Views:
         state: WorldState,
         size: tuple[int, int],
         shadows: bool,
-        canvas: Canvas | None = None,
         soft: bool = True,
     ) -> None:
         """Open OpenGL.
@@ -119,14 +118,13 @@ class Views:
             state: moves the world to a time.
             size: (width, height) of the largest render [px].
             shadows: whether lights cast shadows.
-            canvas: canvas that draws this model; opened here by default.
             soft: whether a lens without distortion is resampled like any other, and so gets the same softness.
 
         Raises:
             DeviceError: the machine cannot render.
         """
         self._model, self._state, self._size, self._soft = model, state, size, soft
-        self.canvas = canvas or Canvas(model, size, shadows)
+        self.canvas = Canvas(model, size, shadows)
         corners = np.stack(np.meshgrid(*([-1, 1],) * 3), axis=-1).reshape(-1, 3)
         self._corners = model.geom_aabb[:, None, :3] + corners * model.geom_aabb[:, None, 3:]
         self._planes = model.geom_rbound == 0
