@@ -303,7 +303,7 @@ SETTINGS = WireSettings(seeds=1)
 QUICK = replace(
     SETTINGS,
     only=tuple(name for name in SETTINGS.only if name not in ("stream_age", "characterize")),
-    domes=("stale-status", "no-status", "missing-is-zero", "continuous-only, stops after 0.4 s"),
+    domes=("stale-status", "no-status", "visca", "continuous-only, stops after 0.4 s"),
     follow_s=10.0,
     poll_s=2.0,
     age_s=4.0,

@@ -1,21 +1,15 @@
 """The whole rig with a dome over the wire: commands drive an emulated rig in another process."""
 
-import contextlib
 import json
 import math
 
 import pytest
 
-from cotarget.errors import StaleFrameError
-from experiments.wire import follow
 from experiments.wire.process import EmulatedRig
 from tests.support.commands import call, refused
 
 pytestmark = [pytest.mark.wire, pytest.mark.render]
 SCENE = {"scene": "indoor", "targets": ["book"], "fixed": {"rate_hz": 10.0}, "zoom": {"rate_hz": 5.0}}
-SECONDS = 15.0
-SHARE = 0.95  # least yield, over that of the simulation with the same rates and delays
-RUNS = 3  # of which one must reach it: a busy machine stalls the emulator
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +41,3 @@ def test_a_camera_in_standby_is_one_line_and_nothing_moves(dome, capsys):
         dome.switch("ptz.standby", False)
     assert "is in standby: switch it on" in said
     assert math.isclose(dome.truth()["pan_deg"], before["pan_deg"])
-
-
-def test_a_person_is_followed_as_well_as_in_the_simulation(tmp_path):
-    rows = []
-    for seed in range(RUNS):
-        with contextlib.suppress(StaleFrameError):
-            rows += follow.run(tmp_path, "visca", SECONDS, seed)
-            print(json.dumps(rows[-1]))
-            if rows[-1]["wire"] >= SHARE * rows[-1]["sim"]:
-                return
-    raise AssertionError(rows)
