@@ -64,7 +64,7 @@ def find_wholes(levels: Sequence[Image], times: int) -> list[SmallTarget]:
         body = sharp[y : y + h, x : x + w] > max(TIMES * usual, FAINTEST * contrast)
         dx, dy, w, h = cv2.boundingRect(body.astype(np.uint8))
         x, y = x + dx, y + dy
-        if unit * max(w, h) < LEAST_PART * width:
+        if unit * max(w, h) < LEAST_PART * width or (w, h) == mask.shape[::-1]:  # nothing is beside the whole image
             continue
         margin = max(2, max(w, h) // 4)
         left, top = max(0, x - margin), max(0, y - margin)
