@@ -105,8 +105,10 @@ class CameraMotion:
         ):
             alike = standing
         if kept.mean() < FEWEST_ALIKE or alike.sum() < fewest:
-            as_before = kept & _alike(flow, np.zeros(2)) & (error.ravel() < SAME_PLACE)
-            self.jumped, self._begun_t = as_before.sum() < FEWEST_STANDING, -math.inf
+            same = kept & (error.ravel() < SAME_PLACE)
+            standing = same & _alike(flow, np.zeros(2))
+            self.jumped = standing.sum() < FEWEST_STANDING and same.mean() < FEWEST_ALIKE
+            self._begun_t = -math.inf
             return
         way = (ahead - self._first).reshape(-1, 2)[alike]
         self._corners, self._first = ahead[kept], self._first[kept]
