@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import DEFAULT_TARGETS
+from cotarget.config import DEFAULT_TARGETS, TargetProfile
 from cotarget.detection import make_detector
 from cotarget.detection.small_target import CameraMotion, find_small_targets
 from cotarget.errors import CotargetError
@@ -367,6 +367,35 @@ def test_a_large_thing_that_passes_before_plain_ground_is_no_cut():
         shift = camera.update(cv2.cvtColor(photograph(np.clip(picture, 0, 255), rng), cv2.COLOR_BGR2GRAY), i / RATE)
         assert not camera.jumped
         assert np.abs(shift).max() < 1.0
+
+
+def test_birds_that_fly_apart_before_a_plain_sky_are_no_cut():
+    """They have all of the corners, and no two fly the same way."""
+    rng = np.random.default_rng(16)
+    birds = [120 + 60 * cv2.GaussianBlur(rng.normal(0, 1, (40, 40, 3)), (0, 0), 1.5) for _ in range(9)]
+    ways = np.array([(np.cos(a), np.sin(a)) for a in np.linspace(0, 2 * np.pi, 9, endpoint=False)])
+    camera = CameraMotion()
+    for i in range(12):
+        picture = np.full((HEIGHT, WIDTH, 3), 170.0)
+        for bird, way in zip(birds, ways, strict=True):
+            u, v = np.rint((WIDTH / 2, HEIGHT / 2) + way * (45 + 6 * i) - 20).astype(int).tolist()
+            seen = picture[max(v, 0) : v + 40, max(u, 0) : u + 40]
+            seen[:] = bird[-seen.shape[0] :, -seen.shape[1] :]
+        camera.update(cv2.cvtColor(photograph(np.clip(picture, 0, 255), rng), cv2.COLOR_BGR2GRAY), i / RATE)
+        assert not camera.jumped
+
+
+def test_black_bars_beside_a_picture_do_not_make_a_target_of_it():
+    rng = np.random.default_rng(17)
+    pictures = []
+    for _ in range(round(RATE)):
+        picture = np.full((HEIGHT, WIDTH, 3), 120.0)
+        picture[:, :6] = picture[:, -6:] = picture[HEIGHT // 2 - 2 : HEIGHT // 2 + 2] = 20.0
+        pictures.append(photograph(picture, rng))
+    detector = make_detector(TargetProfile(4.0, "width", 160.0), RATE)
+    for i, picture in enumerate(pictures):
+        found = detector.detect(Frame(picture, i / RATE)).boxes
+        assert all((each.size_px < (WIDTH, HEIGHT)).any() for each in found)
 
 
 def test_a_bird_alone_in_the_sky_is_not_taken_for_the_cameras_motion():
