@@ -6,7 +6,7 @@ image to boxes, such as a neural network.
 """
 
 import math
-import textwrap
+import reprlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -161,8 +161,6 @@ WHAT_A_BOX_IS = (
 )
 # Score of a box without one.
 UNKNOWN_SCORE = 0.5
-# Longest part of a wrong answer that a message quotes [characters].
-SHOWN = 80
 
 
 class ExternalDetector:
@@ -235,4 +233,4 @@ def _check(box: Box) -> tuple[float, float, float, float, float]:
 
 def _short(value: object) -> str:
     """Format a value on one line, shortened."""
-    return textwrap.shorten(repr(value), SHOWN, placeholder=" ...")
+    return " ".join(reprlib.repr(value).split())

@@ -231,21 +231,27 @@ def _edges(center: float, size: float, extent: int | None, shift: float, clipped
 
 
 def _common_motion(before: Sequence[tuple[Edges, Edges]], after: Sequence[tuple[Edges, Edges]]) -> float:
-    """Length of the common motion of both edges between two groups of boxes [px]; of one edge if only that is seen."""
-    return math.hypot(*(_shift([box[i] for box in before], [box[i] for box in after]) for i in range(2)))
+    """Length of the common motion of both edges between two groups of boxes [px]; of one edge if only that is seen.
+
+    It is 0 of what goes back behind the border that has cut it from the first: a cloud that a tilting camera covers.
+    """
+    along = [_shift([box[i] for box in before], [box[i] for box in after]) for i in range(2)]
+    return math.hypot(*along) if min(along) >= 0 else 0.0
 
 
 def _shift(before: Sequence[Edges], after: Sequence[Edges]) -> float:
-    """Common motion of both edges along one axis [px]; 0 if they move in opposite directions."""
-    moved = []
-    for i in range(2):
-        was = [edges[i] for edges in before if not math.isnan(edges[i])]
-        now = [edges[i] for edges in after if not math.isnan(edges[i])]
-        if was and now:
-            moved.append(statistics.median(now) - statistics.median(was))
+    """Common motion of both edges along one axis [px]; 0 if they move in opposite directions.
+
+    It is negative if the border cuts one edge in the first group, and the other moves to that border.
+    """
+    was, now = (
+        [[side for side in sides if not math.isnan(side)] for sides in zip(*g, strict=True)] for g in (before, after)
+    )
+    moved = [statistics.median(n) - statistics.median(w) for w, n in zip(was, now, strict=True) if w and n]
     if not moved or min(moved) < 0 < max(moved):
         return 0.0
-    return min(map(abs, moved))
+    recedes = (not was[0] and moved[0] < 0) or (not was[1] and moved[0] > 0)
+    return -abs(moved[0]) if recedes else min(map(abs, moved))
 
 
 def _quantile(values: Iterable[float], part: float) -> float:

@@ -29,7 +29,7 @@ from experiments.tables import grouped
 PARTS = ("auto", "background", "base", "exposure", "small_target/*")
 FILES = [f"cotarget/detection/{part}.py" for part in PARTS] + ["cotarget/tracking/track*.py"]
 # Numbers of these files that `auto` and its tracks do not use, or that tune nothing.
-OTHERS = ("FOREGROUND", "UNKNOWN_SCORE", "SHOWN", "IMPOSSIBLE", "BY_MOTION['standing']", "BY_DETECTOR")
+OTHERS = ("FOREGROUND", "UNKNOWN_SCORE", "IMPOSSIBLE", "BY_MOTION['standing']", "BY_DETECTOR")
 FIGURES = ("recall", "precision", "numbers", "false", "first_track_s")
 LEAST = 0.005  # change of a figure that counts
 FAILED = "fails"  # figure of a value with which nothing works

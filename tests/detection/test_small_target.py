@@ -122,6 +122,16 @@ def test_a_helicopter_before_clouds_is_boxed_with_its_blurred_rotor():
             np.testing.assert_allclose(box.size_px, (105, 41), atol=8.0)
 
 
+@pytest.mark.parametrize(("beside_px", "found"), [(1, False), (12, True)])
+def test_what_twinkles_at_the_border_begins_no_track(beside_px, found):
+    """A lamp of 3x3 px in the sky; with one pixel beside it, half of its surroundings are outside."""
+
+    def paint(picture, i):
+        picture[beside_px : beside_px + 3, 100:103] += 20 + 25 * (i % 3)
+
+    assert any(follow(film(30, paint))) == found
+
+
 def test_a_bird_of_one_pixel_before_a_plain_sky_is_found():
     """50 grey levels darker, over a noise of 2; the mean of three by three pixels shows a tenth of that."""
 

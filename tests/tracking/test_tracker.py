@@ -712,6 +712,9 @@ def test_target_that_enters_the_image_travels_by_the_edge_that_is_seen():
     boxes = [[-0.5, 10, right, 70] for right in moving(20, 5, 43)]
     assert travel(boxes, IMAGE, range(20)) == pytest.approx(36.0, abs=3)
     assert travel(boxes) == 0.0  # without the image's size the cut edge counts
+    assert travel(boxes[::-1], IMAGE, range(20)) == 0.0  # it goes back: a cloud that a tilting camera covers
+    flown_out = [[max(left, -0.5), 10, left + 38, 70] for left in moving(20, 20, -20)]
+    assert travel(flown_out, IMAGE, range(10, 20)) == pytest.approx(36.0, abs=3)
     lower_edge_alone = [[-0.5, 10, 639.5, 10 + i] for i in range(20)]
     assert travel(lower_edge_alone, IMAGE, range(20)) == 0.0
 

@@ -201,8 +201,10 @@ def _mask(found: Sequence[Found], shape: tuple[int, ...], times: int) -> Image:
 def _boxed(target: SmallTarget, score: float, shape: tuple[int, ...], times: int) -> Detection:
     """Make a detection of a region of an image of a shape (H, W), enlarged by a factor ``times``."""
     (x, y), (w, h) = target.low, target.size
-    # Interpolation spreads the camera's last pixel over ``times`` pixels.
-    clipped = x < times or y < times or x + w > shape[1] - times or y + h > shape[0] - times
+    # A box that leaves one pixel of the camera beside it has no surroundings there; interpolation spreads each over
+    # ``times`` pixels.
+    rim = 2 * times
+    clipped = x < rim or y < rim or x + w > shape[1] - rim or y + h > shape[0] - rim
     center = np.array([(x + w / 2) / times - 0.5, (y + h / 2) / times - 0.5])
     most = MOST_CLIPPED_SCORE if clipped else 1.0
     return Detection(center, np.array([w / times, h / times]), min(score, most), clipped)
