@@ -183,21 +183,23 @@ class LabelledFilm:
         }
 
 
-def labelled_film(video: Path, labels: Path) -> LabelledFilm:
-    """Read a film of flyers and its labels as published."""
+def labelled_film(video: Path, labels: Path, most: int | None = None) -> LabelledFilm:
+    """Read a film of flyers, or as many frames of it, and its labels as published."""
     with Film(video) as film:
-        return LabelledFilm(video.stem, list(film), film.rate_hz, labels_of(labels), unlabelled_flyers(video.stem))
+        frames = list(itertools.islice(film, most))
+        return LabelledFilm(video.stem, frames, film.rate_hz, labels_of(labels), unlabelled_flyers(video.stem))
 
 
-def film_to_score(video: Path) -> LabelledFilm:
-    """Read a film and its labels, redrawn ones where there are any."""
+def film_to_score(video: Path, most: int | None = None) -> LabelledFilm:
+    """Read a film, or as many frames of it, and its labels, redrawn ones where there are any."""
     own = LABELS / f"{video.stem}.csv"
     if video.stem not in OTHERS:
-        film = labelled_film(video, video.with_suffix(".csv"))
+        film = labelled_film(video, video.with_suffix(".csv"), most)
         return replace(film, labels=read_labels(own), published=film.labels) if own.is_file() else film
     labels = read_labels(VTEST if video.stem == "vtest" else own)
     with Film(video) as opened:
-        return LabelledFilm(video.stem, list(opened), opened.rate_hz, labels, {}, Criterion(), OTHERS[video.stem])
+        frames = list(itertools.islice(opened, most))
+        return LabelledFilm(video.stem, frames, opened.rate_hz, labels, {}, Criterion(), OTHERS[video.stem])
 
 
 def labels_of(path: Path) -> dict[int, list[Label]]:

@@ -222,7 +222,7 @@ def main(text: str) -> None:
     data, names, drawn, frames, changes = json.loads(text)
     cv2.setNumThreads(1)
     half = {path.stem: path for path in films.films_of_half(FilmsSettings(data=data))}
-    searched = [_begin(films.film_to_score(half[name]), frames) for name in names]
+    searched = [films.film_to_score(half[name], frames) for name in names]
     searched += [_drawn(scene, frames) for scene in drawn]
     rows = []
     for change in changes or [None]:
@@ -230,11 +230,6 @@ def main(text: str) -> None:
             change_when_loaded(*change)
         rows += [_row(film) | {"times": change[2] if change else 1.0} for film in searched]
     print(json.dumps(rows))
-
-
-def _begin(film: LabelledFilm, frames: int) -> LabelledFilm:
-    """Keep the first frames of a film."""
-    return replace(film, frames=film.frames[:frames], labels={k: v for k, v in film.labels.items() if k < frames})
 
 
 def _drawn(scene: str, frames: int) -> LabelledFilm:
@@ -269,4 +264,4 @@ def _row(film: LabelledFilm) -> Row:
 
 SETTINGS = NumbersSettings()
 QUICK = replace(SETTINGS, seeds=2, films=("V_DRONE_114",), frames=20, drawn=())
-COST_S = 25.0
+COST_S = 20.0
