@@ -29,8 +29,6 @@ __all__ = ["Track", "Tracker", "TrackingSettings", "tracking_settings"]
 IMPOSSIBLE = 1e6
 # What is covered by a confirmed track's box, enlarged by this factor, belongs to it: a shoe, a rotor.
 NEAR = 1.5
-# A box around a track begins another one if its area is larger by this factor: it may be a flock around a bird.
-LARGER = 4.0
 
 # States (u, v, du, dv), (4,) [px, px/s], and their covariances, (4, 4), by the ids of tracks.
 Expected = Mapping[int, tuple[Array, Array]]
@@ -161,7 +159,7 @@ class Tracker:
         shared = intersection_areas(at, size, center, extent)
         found = np.array([not (state.missed or state.shared) for state in self._tracks], dtype=bool)
         on = shared > covered * _area(size)[:, None]
-        other = found[:, None] & (LARGER * _area(size)[:, None] < _area(extent))
+        other = found[:, None] & (LARGEST_AREA_RATIO * _area(size)[:, None] < _area(extent))
         free = np.all(~on | other, axis=0)
         confirmed = [state for state in self._tracks if state.confirmed]
         wholes = np.array([state.whole for state in confirmed]).reshape(-1, 2)

@@ -16,8 +16,6 @@ from cotarget.rig import Image
 AGES_S = (0.07, 0.17, 0.5, 1.0)
 # Relative tolerance of an image's age.
 AGE_TOLERANCE = 0.5
-# Least time between two kept images [s].
-SPACING_S = 0.03
 # Search for the best match: this many pixels if the camera stands; plus this part of its shift, for parallax and
 # distortion; at most this many, beyond which a target has moved [px].
 SEARCH_PX, SEARCH_PART, MOST_SEARCH_PX = 1, 0.05, 4
@@ -86,15 +84,14 @@ class History:
         if abs(exposure / self._last_exposure - 1) > FLICKER:
             self._kept.clear()
         self._last_exposure = exposure
-        if not self._kept or t - self._kept[-1][0] >= SPACING_S:
-            since = t - self._kept[-1][0] if self._kept else math.inf
-            self._exposure += (1 - math.exp(-since / AVERAGED_S)) * (exposure - self._exposure)
-            self._kept.append((t, grey, shift, self._exposure))
-            while (
-                t - self._kept[0][0] > (1 + AGE_TOLERANCE) * AGES_S[-1]
-                or abs(self._kept[0][3] / self._exposure - 1) > SAME_EXPOSURE
-            ):
-                self._kept.popleft()
+        since = t - self._kept[-1][0] if self._kept else math.inf
+        self._exposure += (1 - math.exp(-since / AVERAGED_S)) * (exposure - self._exposure)
+        self._kept.append((t, grey, shift, self._exposure))
+        while (
+            t - self._kept[0][0] > (1 + AGE_TOLERANCE) * AGES_S[-1]
+            or abs(self._kept[0][3] / self._exposure - 1) > SAME_EXPOSURE
+        ):
+            self._kept.popleft()
         return True
 
     def clear(self) -> None:

@@ -58,8 +58,9 @@ def find_wholes(levels: Sequence[Image], times: int) -> list[SmallTarget]:
     mask = cv2.compare(off, TIMES * usual, cv2.CMP_GT)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
     found = []
-    boxes = cv2.connectedComponentsWithStats(mask, ltype=cv2.CV_16U)[2][1:, :4]  # the first is the background
-    for x, y, w, h in boxes[unit * boxes[:, 2:].max(axis=1) >= LEAST_PART * width].tolist():
+    for x, y, w, h in pieces(np.asarray(mask, dtype=np.uint8), (1, 1)):
+        if unit * max(w, h) < LEAST_PART * width:
+            continue
         contrast = float(sharp[y : y + h, x : x + w].max())
         body = sharp[y : y + h, x : x + w] > max(TIMES * usual, FAINTEST * contrast)
         dx, dy, w, h = cv2.boundingRect(body.astype(np.uint8))

@@ -16,9 +16,6 @@ Weights = tuple[float, float, float, float]
 WEIGHTS: Weights = (2.57, 3.14, -1.44, -3.52)
 # Largest signal that counts: a stronger one does not make up for a lack of change.
 CLEAR_SIGNAL = 30.0
-# A change since long ago counts at most e to this times as much as the most recent one: what has appeared and stands (a
-# cloud uncovers the sun, a door opens) has changed once; a target goes on changing.
-MOST_RISE = 1.5
 
 
 def small_target_score(signal: float, since: Sequence[float], beside: float, weights: Weights = WEIGHTS) -> float:
@@ -43,5 +40,4 @@ def evidence(signal: float, since: Sequence[float], beside: float) -> tuple[floa
     ]
     if not ratios:
         return None
-    ratios = [min(ratio, ratios[0] + MOST_RISE) for ratio in ratios]
     return math.log(min(signal, CLEAR_SIGNAL)), sum(ratios) / len(ratios), math.log1p(beside)
