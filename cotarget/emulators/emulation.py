@@ -15,14 +15,15 @@ import tomli_w
 from cotarget.config import DEFAULT_TARGETS, RigConfig, SimCamera
 from cotarget.emulators.axis_241q import AXIS_FAULTS, AxisServer
 from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
+from cotarget.emulators.onvif import BLOCK as ONVIF_BLOCK
 from cotarget.emulators.onvif import ONVIF_FAULTS, ONVIF_PROFILES, OnvifCamera, OnvifModel, OnvifServer
-from cotarget.emulators.onvif import lens_table as onvif_lens_table
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.ports import UnitPorts
 from cotarget.emulators.ptu_d46.unit import UnitProfile
 from cotarget.emulators.rtsp import RTSP_FAULTS, EncodedStream, Encoder, RtspServer
 from cotarget.emulators.serve import LOCAL, Closes, Faults, JsonLines
-from cotarget.emulators.visca import UNITS, VISCA_FAULTS, ViscaCamera, ViscaModel, ViscaServer, lens_table
+from cotarget.emulators.visca import BLOCK as VISCA_BLOCK
+from cotarget.emulators.visca import UNITS, VISCA_FAULTS, ViscaCamera, ViscaModel, ViscaServer
 from cotarget.emulators.world import LiveWorld
 from cotarget.errors import ConfigError, choices
 from cotarget.schema import Pose, model, validate
@@ -291,7 +292,7 @@ class Emulation(Closes):
         shortest, longest = sim.zoom.focal_mm
         wide_px = shortest / sim.zoom.pitch_mm
         if isinstance(self.ptz, OnvifServer):
-            own: dict[str, Any] = {"port": self.ptz.port, "lens": onvif_lens_table(longest / shortest)}
+            own: dict[str, Any] = {"port": self.ptz.port, "lens": ONVIF_BLOCK.lens_table(longest / shortest)}
         else:
             sony, _, bare_tcp = self.ptz.ports
             own = {
@@ -299,7 +300,7 @@ class Emulation(Closes):
                 "protocol": "tcp" if tcp else "sony",
                 "units": self._units,
                 "url": self.stream.url,
-                "lens": lens_table(longest / shortest),
+                "lens": VISCA_BLOCK.lens_table(longest / shortest),
             }
         return {
             "ptz": {

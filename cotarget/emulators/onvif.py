@@ -10,7 +10,6 @@ Sources: ONVIF Core, Media and PTZ Service Specifications; WS-Security UsernameT
 import base64
 import contextlib
 import hashlib
-import itertools
 import math
 import re
 import secrets
@@ -28,6 +27,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring
 from cotarget.emulators.authentication import Authenticator
 from cotarget.emulators.plant import AxisPlant, LensPlant
 from cotarget.emulators.serve import LOCAL, Faults, TcpServer
+from cotarget.emulators.zoom_block import ZoomBlock
 
 ONVIF_PROFILES = (
     # Moves
@@ -126,9 +126,9 @@ LOST = 0.55  # by which the number of a lost position is too large, as a share o
 # Highest speed by the share of the zoom's range in its logarithm, of domes that limit it [degrees/s].
 CAPS = ((0.2, math.inf), (0.4, 30.0), (0.6, 7.85), (0.8, 4.5), (1.0, 1.5))
 # Numbers and magnifications of a zoom block of 25 x, as shares of the range.
-BLOCK = (
+BLOCK = ZoomBlock((
     (0.0, 1.0), (0.367, 2.0), (0.519, 3.0), (0.683, 5.0), (0.847, 10.0), (0.921, 15.0), (0.968, 20.0), (1.0, 25.0)
-)  # fmt: skip
+))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -152,22 +152,6 @@ class OnvifModel:
     acceleration_deg_s2: float
     stream: str
     size: tuple[int, int]
-
-
-def lens_table(magnification: float) -> list[list[float]]:
-    """List zoom numbers and magnifications of a lens that magnifies so many times at its longest."""
-    power = math.log(magnification) / math.log(BLOCK[-1][1])
-    return [[number, times**power] for number, times in BLOCK]
-
-
-def _interpolated(x: float, knots: Sequence[tuple[float, float]]) -> float:
-    for (x0, y0), (x1, y1) in itertools.pairwise(knots):
-        if x <= x1:
-            return y0 + (y1 - y0) * (max(x, x0) - x0) / (x1 - x0)
-    return knots[-1][1]
-
-
-SHARES = tuple((number, math.log(times) / math.log(BLOCK[-1][1])) for number, times in BLOCK)
 
 
 @dataclass
@@ -264,7 +248,7 @@ class OnvifCamera:
             number = a + (b - a) * (1.0 - share if backward else share)
             width = (b - a) / 2
             found.append(round(number / width, 2) * width if "rounded" in self._faults else number)
-        share = _interpolated(self._lens.position() / self._lens.last, [(y, x) for x, y in SHARES])
+        share = BLOCK.number(self._lens.position() / self._lens.last)
         (a, b), _ = self.numbers()
         return found[0] + lost * (b - a), found[1], share
 
@@ -287,7 +271,7 @@ class OnvifCamera:
                 if goal is not None and not low - 1e-6 <= goal <= high + 1e-6:
                     raise SoapFault("Requested position out of bounds", "InvalidArgVal", "InvalidPosition")
             if zoom is not None:
-                self._lens.command(round(_interpolated(zoom, SHARES) * self._lens.last))
+                self._lens.command(round(BLOCK.share(zoom) * self._lens.last))
             if goals[0] is None or goals[1] is None:
                 return
             if "pan-alone-ignored" in self._faults and not self._both_change(goals[0], goals[1]):

@@ -6,7 +6,6 @@ and its numbers, UDP bare, and TCP bare, served by one thread. Faults can be swi
 Sources: Sony's EVI-D70 and SRG-300H manuals, PTZOptics' VISCA over IP command list.
 """
 
-import bisect
 import contextlib
 import math
 import random
@@ -19,6 +18,7 @@ from dataclasses import dataclass
 
 from cotarget.emulators.plant import AxisPlant, LensPlant
 from cotarget.emulators.serve import LOCAL, Closes, Faults, open_listener
+from cotarget.emulators.zoom_block import ZoomBlock
 from cotarget.errors import DeviceError
 
 VISCA_FAULTS = (
@@ -52,10 +52,10 @@ SPEEDS_EVI = (
     (0, 2, 2.4, 3, 3.7, 4.7, 6.1, 7.4, 9.1, 11, 14, 18, 22, 27, 34, 42, 52, 65, 81),
 )
 # Zoom numbers and magnifications of a block of 25 x; digital zoom, which would go on, is not emulated.
-BLOCK = (
+BLOCK = ZoomBlock((
     (0x0000, 1.0), (0x1781, 2.0), (0x213B, 3.0), (0x2752, 4.0), (0x2BB3, 5.0), (0x315D, 7.0), (0x362C, 10.0),
     (0x3AFA, 15.0), (0x3DF8, 20.0), (0x4000, 25.0),
-)  # fmt: skip
+))  # fmt: skip
 TELE = 0x4000
 
 
@@ -300,26 +300,12 @@ class ViscaCamera:
 
     def _lens_position(self, number: int) -> int:
         """Return the lens's position of a zoom number; its positions are even in the logarithm of the focal length."""
-        share = _interpolate([(float(a), math.log(b)) for a, b in BLOCK], number) / math.log(BLOCK[-1][1])
-        return round(share * self._lens.last)
+        return round(BLOCK.share(number) * self._lens.last)
 
     def _zoom_number(self) -> int:
         if self._lens.position() == self._zoomed[0]:
             return self._zoomed[1]
-        log = self._lens.position() / self._lens.last * math.log(BLOCK[-1][1])
-        return round(_interpolate([(math.log(b), float(a)) for a, b in BLOCK], log))
-
-
-def _interpolate(knots: list[tuple[float, float]], x: float) -> float:
-    at = min(max(bisect.bisect_right([knot[0] for knot in knots], x), 1), len(knots) - 1)
-    (x0, y0), (x1, y1) = knots[at - 1 : at + 1]
-    return y0 + (y1 - y0) * (x - x0) / (x1 - x0)
-
-
-def lens_table(magnification: float) -> list[list[float]]:
-    """List zoom numbers and magnifications of a lens that magnifies so many times at its longest."""
-    power = math.log(magnification) / math.log(BLOCK[-1][1])
-    return [[float(number), times**power] for number, times in BLOCK]
+        return round(BLOCK.number(self._lens.position() / self._lens.last))
 
 
 # The network

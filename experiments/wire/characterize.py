@@ -27,7 +27,7 @@ from cotarget.characterization import SLOW_DEG_S
 from cotarget.cli.emulate import RENDER_THREADS, SWITCH_S
 from cotarget.config import RigConfig, parse_config
 from cotarget.emulators.emulation import Emulation
-from cotarget.emulators.onvif import lens_table
+from cotarget.emulators.onvif import BLOCK
 from cotarget.emulators.world import paced
 from cotarget.errors import DeviceError
 from cotarget.files import write_atomically
@@ -185,7 +185,7 @@ def _growth_off(config: RigConfig, keys: Mapping[str, Any]) -> float:
     """Return the largest relative error of a magnification."""
     world = SimWorld(config, rendered=())
     shortest, longest = world.rig.zoom.focal_range
-    numbers, times = np.array(lens_table(longest / shortest)).T
+    numbers, times = np.array(BLOCK.lens_table(longest / shortest)).T
     worst, first = 0.0, world.zoom_lens_for(shortest).focal_px[0]
     for number, found in keys["lens"]:
         nominal_px = shortest * math.exp(np.interp(number, numbers, np.log(times)))

@@ -9,7 +9,7 @@ from xml.etree.ElementTree import fromstring
 
 import pytest
 
-from cotarget.emulators.onvif import TDS, TPTZ, TT, envelope, lens_table
+from cotarget.emulators.onvif import BLOCK, TDS, TPTZ, TT, envelope
 from tests.support.onvif_dome import STEP_DEG, OnvifUnit
 from tests.support.plants import PASSWORD, USER, wait_for
 
@@ -246,7 +246,7 @@ def test_what_is_no_message_is_a_fault(data):
 
 
 def test_the_lens_magnifies_as_it_is_told():
-    table = lens_table(12.0)
+    table = BLOCK.lens_table(12.0)
     assert table[0] == [0.0, 1.0]
     assert table[-1] == [1.0, pytest.approx(12.0)]
     assert all(b[0] > a[0] and b[1] > a[1] for a, b in itertools.pairwise(table))
