@@ -39,7 +39,7 @@ FAILED = "fails"  # figure of a value with which nothing works
 class NumbersSettings(FilmsSettings):
     """Settings: films, and by how much a number is changed."""
 
-    films: tuple[str, ...] = ("V_BIRD_021", "V_DRONE_114", "V_HELICOPTER_012", "V_AIRPLANE_047", "car", "persons")
+    films: tuple[str, ...] = ("V_BIRD_021", "V_DRONE_114", "V_HELICOPTER_012", "V_AIRPLANE_047", "car", "vtest")
     drawn: tuple[str, ...] = ("rain", "foliage")
     frames: int = 100  # searched of each film, from the first on
     times: float = 1.3  # a number is multiplied and divided by this

@@ -27,9 +27,9 @@ MANY = 24
 # If less than this part of the corners is found again, or of these at one shift, the film was cut or the camera was
 # moved. Standing corners count as the scene's from this part on.
 FEWEST_ALIKE = 0.35
-# Fewest corners that stand and look the same, by this mean difference [grey levels], where the film goes on: a large
-# target before plain ground has the others. After a cut none do, but those of writing.
-FEWEST_STANDING, SAME_PLACE = 5, 12.0
+# Mean difference of a corner's surroundings up to which they look as before [grey levels]. While the part above of the
+# corners does, the film goes on, wherever they have gone: before a plain sky all are on birds.
+SAME_LOOK = 12.0
 # Time after which corners are detected again, because some have drifted off and some are on a target [s].
 RENEW_S = 0.5
 # Window in which a corner is tracked, and pyramid levels: up to 20 px a frame of the full image.
@@ -105,9 +105,7 @@ class CameraMotion:
         ):
             alike = standing
         if kept.mean() < FEWEST_ALIKE or alike.sum() < fewest:
-            same = kept & (error.ravel() < SAME_PLACE)
-            standing = same & _alike(flow, np.zeros(2))
-            self.jumped = standing.sum() < FEWEST_STANDING and same.mean() < FEWEST_ALIKE
+            self.jumped = np.mean(kept & (error.ravel() < SAME_LOOK)) < FEWEST_ALIKE
             self._begun_t = -math.inf
             return
         way = (ahead - self._first).reshape(-1, 2)[alike]
