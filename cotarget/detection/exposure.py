@@ -12,14 +12,14 @@ from cotarget.rig import Image
 
 # Cells along width and height in which brightness is compared.
 CELLS = (32, 24)
-# Median deviation of the cells from the common change, and least change. Beyond these, the picture has changed and not
-# the exposure.
-AGREEMENT, DARKEST = 0.1, 1 / 3
+# Relative change of brightness beyond which the picture is another: of the median cell, from the change that they have
+# in common; and of an image, from the one before, because lamps flicker by less.
+OTHER_PICTURE = 0.15
+# Least change that is one of the exposure.
+DARKEST = 1 / 3
 # Images are compared if their exposures differ by at most this part, because a codec draws texture again; time over
 # which exposures are averaged for it, so that a lamp may flicker and a cloud pass [s].
 SAME_EXPOSURE, AVERAGED_S = 0.02, 0.5
-# Largest change of a lamp that flickers from one image to the next; beyond it a light was switched or the film was cut.
-FLICKER = 0.15
 
 
 class Exposure:
@@ -47,7 +47,7 @@ class Exposure:
         ratio = cells / self._reference
         change = float(np.median(ratio))
         since, self._t = max(0.0, t - self._t), t
-        if np.median(np.abs(ratio / change - 1)) > AGREEMENT or not DARKEST < change < BRIGHTEST:
+        if np.median(np.abs(ratio / change - 1)) > OTHER_PICTURE or not DARKEST < change < BRIGHTEST:
             self._changed_t = t if self._changed_t is None else self._changed_t
             if t - self._changed_t >= LASTING_S:
                 self._reference, self._changed_t = cells / self._change, None

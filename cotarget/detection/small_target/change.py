@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cotarget.detection.exposure import AVERAGED_S, FLICKER, SAME_EXPOSURE
+from cotarget.detection.exposure import AVERAGED_S, OTHER_PICTURE, SAME_EXPOSURE
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
@@ -81,7 +81,7 @@ class History:
             usual = difference[difference <= 2 * float(np.median(difference)) + 2]
             self.noise = max(LEAST_NOISE, float(usual.mean()))
         self._last = grey
-        if abs(exposure / self._last_exposure - 1) > FLICKER:
+        if abs(exposure / self._last_exposure - 1) > OTHER_PICTURE:
             self._kept.clear()
         self._last_exposure = exposure
         since = t - self._kept[-1][0] if self._kept else math.inf
