@@ -80,8 +80,6 @@ def _around(kept: "deque[tuple[float, ...]]", t: float) -> Array:
     return np.array([kept[i] for i in range(first, min(first + POINTS, len(kept)))])
 
 
-# Longest time in which a target is covered by what it goes behind [s]: half of what its filter keeps.
-LONGEST_COVER_S = 0.75
 MakeFinder = Callable[[Calibration, TargetProfile], Finder]
 
 
@@ -359,7 +357,10 @@ class TargetFusion:
         settings: FusionSettings = FusionSettings(),
     ) -> None:
         self._profile, self._settings = profile, settings
-        self._make_filter = partial(TargetFilter, calibration, profile, filter or filter_settings(profile, calibration))
+        filter = filter or filter_settings(profile, calibration)
+        self._make_filter = partial(TargetFilter, calibration, profile, filter)
+        # Longest time in which a target is covered by what it goes behind: half of what its filter keeps [s].
+        self._longest_cover_s = filter.history_s / 2
         self.targets: dict[int, Target] = {}
         self.camera = calibration.fixed
         self._lost_view = False
@@ -457,7 +458,7 @@ class TargetFusion:
         """
         assert target.filter is not None, "who is kept has one"
         seen_t = target.track.seen_t
-        cover_s = min(2 * (seen_t - target.part_since_t), LONGEST_COVER_S)
+        cover_s = min(2 * (seen_t - target.part_since_t), self._longest_cover_s)
         if t - seen_t > cover_s > 0:
             target.filter = target.filter.without(seen_t - cover_s, seen_t)
 
@@ -475,7 +476,10 @@ class TargetFusion:
         assert target.filter is not None, "who measures has made one"
         track, box, sigma_px, size_px = target.track, target.track.box, None, None
         lacks = missing(track.size_px, box.size_px)
-        target.part_since_t = min(target.part_since_t, frame.t) if lacks.any() else math.inf
+        if lacks.any() or missing(target.whole_px, box.size_px).any():
+            target.part_since_t = min(target.part_since_t, frame.t)
+        else:
+            target.part_since_t, target.whole_px = math.inf, track.size_px
         if track.shared:  # its box covers other targets too: it bounds the place and shows no size
             sigma_px = np.hypot(room_inside(box.size_px, track.size_px), track.size_px / 2)
             box = Detection(track.center_px, np.zeros(2), track.score, clipped=True)

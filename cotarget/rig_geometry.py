@@ -120,16 +120,17 @@ class ZoomHead:
         return np.asarray(self._base_fixed @ np.array((x, y, z, 1.0)))
 
     @cached_property
-    def _vertical_fixed(self) -> list[float]:
+    def pan_axis_fixed(self) -> tuple[float, float, float]:
         """Direction of the pan axis, downwards, in the fixed camera's frame, (3,)."""
-        return list(self._base_fixed[1, :3].tolist())
+        right, down, ahead = self._base_fixed[1, :3].tolist()
+        return right, down, ahead
 
     def fixed_roll(self, x: float, y: float) -> float:
         """Compute the angle from the fixed image's v axis to the pan axis, as it appears at tangents x, y [rad].
 
         It is within a quarter turn, because no target's size tells up from down.
         """
-        right, down, ahead = self._vertical_fixed
+        right, down, ahead = self.pan_axis_fixed
         return _within_quarter(right - x * ahead, down - y * ahead)
 
     @cached_property

@@ -196,11 +196,13 @@ def _eligible(candidates: Sequence[Candidate]) -> Sequence[Candidate]:
 
     If none can be reached, all stay, so that the run can report why. If none is likely, all reachable ones stay, since
     nominal size or calibration may be wrong. An unlikely one is for example a cloud taken for a person. One that has
-    been hidden for long is waited for while no other is in sight.
+    been hidden for long is waited for while nothing else in sight is surely a target.
     """
     reachable = [candidate for candidate in candidates if candidate.reachable] or candidates
     likely = [candidate for candidate in reachable if candidate.likely] or reachable
-    return [candidate for candidate in likely if not candidate.track.hidden] or likely
+    if not any(candidate.track.hidden for candidate in likely):
+        return likely
+    return [candidate for candidate in likely if candidate.track.sure and not candidate.track.hidden] or likely
 
 
 @dataclass

@@ -60,6 +60,10 @@ class MotionSettings:
         bias_s: time constant of that bias [s].
         nearest: least depth of a target, along the fixed camera's axis [m].
         turns: whether the acceleration turns with the velocity, as in a coordinated turn.
+        slope: acceleration and velocity along the pan axis over those across it: of what walks on the ground, the slope
+            of the ground.
+        pan_axis: direction of the pan axis in the fixed camera's frame; None if it is not known, and all directions are
+            alike.
     """
 
     acceleration: float
@@ -73,6 +77,18 @@ class MotionSettings:
     bias_s: float = 60.0
     nearest: float = 0.1
     turns: bool = False
+    slope: float = 1.0
+    pan_axis: tuple[float, float, float] | None = None
+
+    @property
+    def anisotropy(self) -> Array:
+        """Covariance of acceleration and velocity over the variances across the pan axis, (3, 3)."""
+        n = np.zeros(3) if self.pan_axis is None else np.array(self.pan_axis)
+        return np.eye(3) - (1 - self.slope**2) * np.outer(n, n)
+
+    def prior(self, depth: float) -> Array:
+        """Covariance of a velocity and an acceleration that are not known, divided by the depth [m], (6, 6)."""
+        return np.kron(np.diag([self.speed**2, self.acceleration**2]), self.anisotropy) / depth**2
 
     @property
     def fading_s(self) -> float:
@@ -129,7 +145,7 @@ class FilterSettings:
 # Of a target of which nothing is known, motion and attitude lie between a walking and a flying one's.
 MOTIONS = {
     "standing": MotionSettings(0.8, 0.3, 1.5, 0.01, attitude_sigma=0.01, attitude_s=2.0),
-    "walking": MotionSettings(0.8, 0.7, 1.2, 0.04),
+    "walking": MotionSettings(1.0, 0.5, 1.2, 0.04, slope=0.2),
     "flying": MotionSettings(6.5, 5.0, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0, turns=True),
     "general": MotionSettings(2.5, 1.0, 3.0, 0.075, attitude_sigma=0.2, attitude_s=1.0),
 }
@@ -150,6 +166,8 @@ def filter_settings(target: TargetProfile, calibration: Calibration | None = Non
         calibration: calibration of the rig; None, or one without covariance, leaves the usual bias.
     """
     motion = replace(MOTIONS[target.motion], nearest=NEAREST_SIZES * target.size)
+    if calibration is not None and calibration.zoom_head.T_head_zoom is not None:
+        motion = replace(motion, pan_axis=calibration.zoom_head.pan_axis_fixed)
     if calibration is not None and calibration.covariance is not None:
         middle = calibration.fixed.lens.image_center_px
         sigma = float(predicted_pointing(calibration, middle, USUAL_DEPTH)) / math.sqrt(2)  # along one axis
@@ -160,7 +178,7 @@ def filter_settings(target: TargetProfile, calibration: Calibration | None = Non
 
 STATES = 13
 TAN_X, TAN_Y, LOG_DEPTH, VEL_X, VEL_Y, VEL_Z, ACC_X, ACC_Y, ACC_Z, LOG_SIZE, LOG_APPARENT, PAN, TILT = range(STATES)
-VELOCITY, ACCELERATION = slice(VEL_X, ACC_X), slice(ACC_X, LOG_SIZE)
+VELOCITY, ACCELERATION, MOTION = slice(VEL_X, ACC_X), slice(ACC_X, LOG_SIZE), slice(VEL_X, LOG_SIZE)
 MOVING = slice(TAN_X, LOG_SIZE)  # position, velocity and acceleration; the other four components drift
 SEEN = [TAN_X, TAN_Y, LOG_DEPTH, PAN, TILT]  # components that a measurement in the zoom image depends on
 OF_SIZE = np.zeros(STATES)  # derivative of a measured size by the state
@@ -200,7 +218,7 @@ def transition(dt: float, motion: MotionSettings) -> tuple[Array, Array, Array, 
     sigmas = np.zeros(STATES)
     sigmas[LOG_APPARENT:] = motion.attitude_sigma, motion.bias_sigma, motion.bias_sigma
     drift = np.diag(sigmas**2 * (1 - linear.diagonal() ** 2))
-    return linear, np.kron(_singer(dt, tau), np.eye(3)).astype(float), drift, fade
+    return linear, np.kron(_singer(dt, tau), motion.anisotropy).astype(float), drift, fade
 
 
 def _turned(x: Array, P: Array, dt: float, tau: float) -> tuple[Array, Array]:

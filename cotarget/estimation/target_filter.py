@@ -28,6 +28,7 @@ from cotarget.estimation.motion_model import (
     LOG_APPARENT,
     LOG_DEPTH,
     LOG_SIZE,
+    MOTION,
     OF_SIZE,
     PAN,
     SEEN,
@@ -39,7 +40,6 @@ from cotarget.estimation.motion_model import (
     VEL_X,
     VEL_Y,
     VEL_Z,
-    VELOCITY,
     FilterSettings,
     filter_settings,
     propagate,
@@ -142,14 +142,13 @@ def begin(observed: Observation, settings: FilterSettings) -> Node:
     x[LOG_DEPTH] = math.log(USUAL_DEPTH)
     if observed.log_depth is not None and not observed.bound:
         x[LOG_DEPTH] = observed.log_depth + x[LOG_APPARENT]
-    nearness = math.exp(-x[LOG_DEPTH])
     sigma = np.zeros(STATES)
     sigma[LOG_DEPTH] = settings.depth_sigma
-    sigma[VELOCITY], sigma[ACCELERATION] = motion.speed * nearness, motion.acceleration * nearness
     sigma[[LOG_SIZE, LOG_APPARENT]] = motion.size_sigma, motion.attitude_sigma
     sigma[[PAN, TILT]] = motion.bias_sigma
     P = np.diag(sigma**2)
     P[:2, :2] = observed.R
+    P[MOTION, MOTION] = motion.prior(math.exp(x[LOG_DEPTH]))
     return _correct_size(Node(observed.t, x, P), observed, settings)
 
 
@@ -268,15 +267,16 @@ def _restarted(node: Node, observed: Observation, settings: FilterSettings) -> N
     x, P = node.x.copy(), node.P.copy()
     x[:2] = observed.tangent
     x[ACCELERATION] = 0.0  # the velocity stays the best guess: a target that is carried off is soon farther off
-    moving = range(VEL_X, LOG_SIZE)
-    restarted = [TAN_X, TAN_Y, *moving]
+    restarted = [TAN_X, TAN_Y, *range(VEL_X, LOG_SIZE)]
     P[restarted] = 0.0
     P[:, restarted] = 0.0
     P[:2, :2] = observed.R
     P[LOG_DEPTH, LOG_DEPTH] += settings.inflation**2
-    P[moving, moving] = (np.repeat([motion.speed, motion.acceleration], 3) * math.exp(-x[LOG_DEPTH])) ** 2
+    P[MOTION, MOTION] = motion.prior(math.exp(x[LOG_DEPTH]))
     # It is faster than was expected, except along the axis, where only sizes measure, and badly.
-    P[[VEL_X, VEL_Y], [VEL_X, VEL_Y]] *= settings.most_noise_scale
+    faster = math.sqrt(settings.most_noise_scale)
+    P[[VEL_X, VEL_Y]] *= faster
+    P[:, [VEL_X, VEL_Y]] *= faster
     return replace(node, x=x, P=P, rejected_fixed=0, rejected_zoom=0, mean_nis=1.0)
 
 

@@ -394,6 +394,7 @@ class Track:
         shared: whether that detection covers other tracks too, so that it only bounds this one's place.
         seen_t: time of that detection [s].
         hidden: whether it is out of sight for longer than a track lives without an expected place.
+        sure: whether its score alone makes it a target, and not only with its travel: a cloud travels too.
     """
 
     id: int
@@ -411,6 +412,7 @@ class Track:
     shared: bool = False
     seen_t: float = -math.inf
     hidden: bool = False
+    sure: bool = True
 
     @property
     def reported(self) -> bool:
@@ -583,6 +585,7 @@ class LiveTrack:
             shared=self.shared,
             seen_t=self.seen,
             hidden=self.hidden,
+            sure=self.mean_score >= self.settings.confirm_score,
         )
 
     def variance(self, detection: Detection) -> list[float]:

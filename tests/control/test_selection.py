@@ -74,6 +74,16 @@ def test_what_is_hidden_is_waited_for_only_while_nothing_else_is_in_sight(make):
     assert selector.select([behind, candidate(2)], STILL, LIMITS) == 2
 
 
+def test_a_hidden_target_is_not_left_for_what_may_be_a_cloud():
+    behind = replace(candidate(1), track=replace(track(1), missed=30, hidden=True))
+    cloud = replace(candidate(2), track=replace(track(2), sure=False))
+    selector = FirstCome()
+    assert selector.select([candidate(1), cloud], STILL, LIMITS) == 1
+    assert selector.select([behind, cloud], STILL, LIMITS) == 1
+    assert selector.select([behind, cloud, candidate(3)], STILL, LIMITS) == 3
+    assert selector.select([cloud], STILL, LIMITS) == 2
+
+
 def test_a_chosen_target_that_comes_out_elsewhere_is_taken_while_its_track_is_hidden():
     selector = Chosen(number=1)
     selector.start((640, 480))

@@ -144,6 +144,18 @@ def test_the_noise_is_that_of_singers_acceleration(dt, tolerance):
         np.testing.assert_allclose(P[np.ix_(own, own)], M[3:, 3:].T @ M[:3, 3:], rtol=tolerance)
 
 
+def test_who_walks_changes_its_height_less_than_its_place():
+    """On a slope of 0.2, the variance along the pan axis is 0.04 of that across it, in a camera that looks down."""
+    down = np.array([0.0, 0.8, 0.6])
+    P = propagate(state(), ZERO, 0.5, MotionSettings(3.0, 1.0, 1e6, 0.04, slope=0.2, pan_axis=tuple(down)))[1]
+    across, ahead = np.array([1.0, 0.0, 0.0]), np.array([0.0, -0.6, 0.8])
+    for begin in (0, 3, 6):  # position at 1 m, velocity, acceleration
+        of = P[begin : begin + 3, begin : begin + 3]
+        assert ahead @ of @ ahead == pytest.approx(across @ of @ across)
+        assert down @ of @ down == pytest.approx(0.04 * (across @ of @ across))
+        assert down @ of @ ahead == pytest.approx(0.0, abs=1e-9)
+
+
 def test_noise_along_the_axis_moves_a_target_off_the_axis_in_the_image():
     """a = X / Z, b = Y / Z and l = log Z change by (dX - a dZ) / Z, (dY - b dZ) / Z and dZ / Z."""
     a, b, Z = 0.5, -0.25, 8.0

@@ -215,6 +215,13 @@ def test_a_hidden_target_that_comes_out_where_it_is_expected_keeps_its_number():
     assert [(track.id, track.confirmed, track.hidden) for track in tracks] == [(1, True, True), (2, False, False)]
 
 
+def test_what_travels_with_a_poor_score_is_confirmed_and_not_sure():
+    tracker = Tracker(tracking_settings(replace(MOVING_BIRD, detector="auto")), SIZE)
+    for t in np.arange(0.0, 2.0, 1 / RATE):
+        found = tracker.update([seen(100 + 60 * t, 100, score=0.4), seen(100 + 60 * t, 300, score=0.8)], t)
+    assert [(track.confirmed, track.sure) for track in found] == [(True, False), (True, True)]
+
+
 def test_a_target_that_comes_out_piece_by_piece_has_the_number_and_size_of_before():
     """40 px wide, at 60 px/s behind 180 px: its boxes shrink to 4 px, and after 2.5 s they grow from there."""
     tracker, found = Tracker(replace(PLAIN, noise_of_size=0.04), SIZE), []
