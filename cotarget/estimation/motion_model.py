@@ -84,11 +84,11 @@ class MotionSettings:
     def anisotropy(self) -> Array:
         """Covariance of acceleration and velocity over the variances across the pan axis, (3, 3)."""
         n = np.zeros(3) if self.pan_axis is None else np.array(self.pan_axis)
-        return np.eye(3) - (1 - self.slope**2) * np.outer(n, n)
+        return np.asarray(np.eye(3) - (1 - self.slope**2) * np.outer(n, n))
 
     def prior(self, depth: float) -> Array:
         """Covariance of a velocity and an acceleration that are not known, divided by the depth [m], (6, 6)."""
-        return np.kron(np.diag([self.speed**2, self.acceleration**2]), self.anisotropy) / depth**2
+        return np.asarray(np.kron(np.diag([self.speed**2, self.acceleration**2]), self.anisotropy) / depth**2)
 
     @property
     def fading_s(self) -> float:
