@@ -7,7 +7,7 @@ import time
 import pytest
 
 from cotarget.emulators.serve import Faults
-from cotarget.emulators.visca import VISCA_FAULTS, ViscaCamera, ViscaModel, ViscaServer, lens_table
+from cotarget.emulators.visca import BLOCK, VISCA_FAULTS, ViscaCamera, ViscaModel, ViscaServer
 from tests.formats.lists import assert_listed
 from tests.support.emulated_camera import DEADLINE_S, LensModel
 from tests.support.plants import AxisModel
@@ -120,8 +120,8 @@ def test_faults_of_the_firmware(camera, fault, order, answer):
 
 
 def test_lens_table_is_the_blocks_for_its_own_ratio():
-    assert lens_table(25.0)[6] == [0x362C, pytest.approx(10.0)]
-    assert lens_table(5.0)[-1] == [0x4000, pytest.approx(5.0)]
+    assert BLOCK.lens_table(25.0)[6] == [0x362C, pytest.approx(10.0)]
+    assert BLOCK.lens_table(5.0)[-1] == [0x4000, pytest.approx(5.0)]
 
 
 def test_its_faults_are_listed():

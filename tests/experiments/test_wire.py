@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import parse_config
-from cotarget.emulators.onvif import lens_table
+from cotarget.emulators.onvif import BLOCK
 from experiments.wire import characterize, command, faults, latency, wire
 from experiments.wire.command import Notes, Turn
 from experiments.wire.rig import Tap
@@ -105,7 +105,7 @@ def test_what_was_found_of_a_dome_is_compared_with_the_truth():
     facts = replace(characterize.drawn(0), signs=(-1, 1), picture=("upside-down",), stop_s=0.4)
     keys = {"pan_sign": -1, "pan_deg": [0.9 * end for end in head.pan_deg], "tilt_deg": list(head.tilt_deg)}
     keys |= {"stop_delay_s": 0.43, "latency_s": 0.25, "command_delay_s": 0.05}
-    keys |= {"lens": lens_table(longest / shortest)}
+    keys |= {"lens": BLOCK.lens_table(longest / shortest)}
     row = characterize.errors(facts, config, keys, "Its picture is upside down, against the fixed camera's", 0.31)
     assert row["signs"]
     assert row["orientation"]
