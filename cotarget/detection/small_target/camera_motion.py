@@ -27,9 +27,9 @@ MANY = 24
 # If less than this part of the corners is found again, or of these at one shift, the film was cut or the camera was
 # moved. Standing corners count as the scene's from this part on.
 FEWEST_ALIKE = 0.35
-# Mean difference of a corner's surroundings up to which they look as before [grey levels]. While the part above of the
-# corners does, the film goes on, wherever they have gone: before a plain sky all are on birds.
-SAME_LOOK = 12.0
+# Mean difference of a corner's surroundings up to which they look as before [grey levels]. While half of the corners do,
+# the film goes on, wherever they have gone: before a plain sky all are on birds.
+SAME_LOOK = 8.0
 # Time after which corners are detected again, because some have drifted off and some are on a target [s].
 RENEW_S = 0.5
 # Window in which a corner is tracked, and pyramid levels: up to 20 px a frame of the full image.
@@ -105,7 +105,7 @@ class CameraMotion:
         ):
             alike = standing
         if kept.mean() < FEWEST_ALIKE or alike.sum() < fewest:
-            self.jumped = np.mean(kept & (error.ravel() < SAME_LOOK)) < FEWEST_ALIKE
+            self.jumped = np.mean(kept & (error.ravel() < SAME_LOOK)) < 0.5
             self._begun_t = -math.inf
             return
         way = (ahead - self._first).reshape(-1, 2)[alike]
