@@ -27,9 +27,10 @@ MANY = 24
 # If less than this part of the corners is found again, or of these at one shift, the film was cut or the camera was
 # moved. Standing corners count as the scene's from this part on.
 FEWEST_ALIKE = 0.35
-# Mean difference of a corner's surroundings up to which they look as before [grey levels]. While half of the corners do,
-# the film goes on, wherever they have gone: before a plain sky all are on birds.
-SAME_LOOK = 8.0
+# A film goes on while half of the corners look as before, to this mean difference of their surroundings [grey levels],
+# wherever they have gone: before a plain sky all are on birds. Or while so many stand: a car that fills the image is
+# blurred. After a cut only those of writing do.
+SAME_LOOK, FEWEST_STANDING = 8.0, 5
 # Time after which corners are detected again, because some have drifted off and some are on a target [s].
 RENEW_S = 0.5
 # Window in which a corner is tracked, and pyramid levels: up to 20 px a frame of the full image.
@@ -105,7 +106,8 @@ class CameraMotion:
         ):
             alike = standing
         if kept.mean() < FEWEST_ALIKE or alike.sum() < fewest:
-            self.jumped = np.mean(kept & (error.ravel() < SAME_LOOK)) < 0.5
+            look, stand = error.ravel() < SAME_LOOK, _alike(flow, np.zeros(2))
+            self.jumped = np.mean(kept & look) < 0.5 and np.count_nonzero(kept & stand) < FEWEST_STANDING
             self._begun_t = -math.inf
             return
         way = (ahead - self._first).reshape(-1, 2)[alike]
