@@ -106,8 +106,9 @@ class CameraMotion:
         ):
             alike = standing
         if kept.mean() < FEWEST_ALIKE or alike.sum() < fewest:
-            look, stand = error.ravel() < SAME_LOOK, _alike(flow, np.zeros(2))
-            self.jumped = np.mean(kept & look) < 0.5 and np.count_nonzero(kept & stand) < FEWEST_STANDING
+            look = int(np.count_nonzero(kept & (error.ravel() < SAME_LOOK)))
+            stand = int(np.count_nonzero(kept & _alike(flow, np.zeros(2))))
+            self.jumped = 2 * look < len(kept) and stand < FEWEST_STANDING
             self._begun_t = -math.inf
             return
         way = (ahead - self._first).reshape(-1, 2)[alike]
