@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cotarget.estimation.motion_model import CENTER_GATE, LOG_DEPTH, STATES, MotionSettings
+from cotarget.estimation.motion_model import CENTER_GATE, GATE, LOG_DEPTH, STATES, MotionSettings
 from cotarget.estimation.target_filter import Observation, variance_factor
+from cotarget.geometry import Array
 
 # Prior standard deviations: of the offset, that of cameras on a network [s]; of the depth's logarithm by a size that
 # may be wrong by a factor.
@@ -37,6 +38,7 @@ class ClockOffset:
 
     def __init__(self, motion: MotionSettings) -> None:
         """Start without measurements, with the motion of the targets."""
+        self._speed = motion.speed
         bias, attitude = motion.bias_sigma, motion.attitude_sigma
         self._x, self._P = np.zeros(4), np.diag(np.square([OFFSET_SIGMA_S, DEPTH_SIGMA, bias, bias]))
         gained = [DRIFT_S**2, 2 * attitude**2 / motion.attitude_s, *[2 * bias**2 / motion.bias_s] * 2]
@@ -109,6 +111,8 @@ class ClockOffset:
         inverse = np.linalg.inv(powers.T @ powers)
         (place, rate, _) = inverse @ powers.T @ values
         left = values - powers @ (inverse @ powers.T @ values)
+        if self._shows_a_part(values[:, 2], float(rate[2]), left[:, 2], fixed):
+            return
         variance = np.sum(left[:, :2] ** 2, axis=0) / (len(fixed) - FEWEST + 2)
         if np.sum(rate[:2] ** 2) <= CENTER_GATE * inverse[1, 1] * variance.sum():  # it may stand
             return
@@ -128,3 +132,18 @@ class ClockOffset:
         gain = self._P @ H.T @ np.linalg.inv(S)
         self._x = self._x + gain @ innovation
         self._P = self._P - gain @ H @ self._P
+
+    def _shows_a_part(self, logs: Array, rate: float, left: Array, fixed: Sequence[Observation]) -> bool:
+        """Whether a target goes behind something or comes out: what is seen of it then moves otherwise than it does.
+
+        Its size changes faster than by its fastest approach, or not as a parabola, by three standard deviations.
+
+        Args:
+            logs: logarithms of the depth by the size, (n,).
+            rate: their change in a second at the zoom frame's time.
+            left: what a parabola leaves of them, (n,).
+            fixed: the observations.
+        """
+        sigma = min(each.log_depth_sigma for each in fixed)  # of a whole box
+        fastest = self._speed * math.exp(-float(logs.mean()))
+        return rate * rate > GATE * fastest**2 or bool((left**2 > GATE * sigma**2).any())

@@ -1,6 +1,7 @@
 """The offset of the cameras' clocks against simulated truth, by targets that move, of wrong sizes, and that stand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,13 +17,21 @@ SURE = 0.016  # its standard deviation by then [s]
 UNKNOWN = 0.03  # standard deviation while nothing tells the offset from a wrong size [s]
 
 
-def estimated(flight, late_s):
-    """Follow a target with the fixed camera's stamps late by so much [s]; return the offset."""
+def estimated(flight, late_s, edge_px=0.0):
+    """Follow a target with the fixed camera's stamps late by so much [s]; return the offset.
+
+    In the fixed image, what is left of an edge is hidden [px].
+    """
     target_filter = TargetFilter(flight.calibration, flight.target)
     clock = ClockOffset(filter_settings(flight.target).motion)
     for t in flight.times:
         box, view = flight.wide(t), flight.zoom(t + APART)
         if box is not None:
+            left, right = box.center_px[0] + box.size_px[0] * np.array([-0.5, 0.5])
+            if right < edge_px:
+                continue
+            hidden = np.array([max(edge_px - left, 0.0), 0.0])
+            box = replace(box, center_px=box.center_px + hidden / 2, size_px=box.size_px - hidden)
             target_filter.add_fixed(box, t + late_s)
         if view is not None:
             show(target_filter, view)
@@ -62,6 +71,17 @@ def test_stamps_are_corrected_step_by_step_and_frames_stay_in_their_order():
     assert sum(begun) == 1  # the filter restarts once, when the correction is there
     assert corrections[-1] == clock.late_s
     assert np.diff(np.arange(25) / 100 - corrections).min() >= -math.ulp(1.0)  # at a hundred frames a second
+
+
+def test_a_target_that_comes_out_from_behind_something_shows_no_offset():
+    """What is seen of it moves more slowly than the target, as if the stamps were late."""
+    t = np.linspace(0.0, 4.0, 81)
+    carried = np.interp(t, [0.0, 1.2, 1.5, 2.5, 4.0], [0.0, 1.5, 1.6, 1.1, 1.1])  # to the right, then back
+    way = CubicSpline(t, np.c_[carried - 0.5, np.full(len(t), 0.2), np.full(len(t), 10.0)])
+    flight = Flight("book", 300, 2.4, path=way)
+    edge_px = float(flight.wide(1.1).center_px[0])
+    clock = estimated(flight, 0.0, edge_px)
+    assert all(clock.correct() == 0.0 for _ in range(10))
 
 
 def test_another_target_keeps_the_offset():
