@@ -6,11 +6,12 @@ swings along its x axis until the next request. The answer `{"ok": true}` comes 
 it is not possible.
 """
 
+import contextlib
 import json
 import re
 import socket
 import sys
-from typing import Annotated, TextIO
+from typing import Annotated, BinaryIO, TextIO
 
 import numpy as np
 
@@ -51,11 +52,7 @@ class BoardSettings:
 
 
 def make_board(config: BoardSettings) -> "PersonBoard | SocketBoard":
-    """Open the configured holder of the board: a person, or a program at a socket.
-
-    Raises:
-        DeviceError: no program listens at the socket.
-    """
+    """Make the configured holder of the board: a person, or a program at a socket, which is connected to when asked."""
     address = socket_address(config.presenter)
     return PersonBoard(sys.stderr) if address is None else SocketBoard(*address)
 
@@ -66,8 +63,12 @@ def probe(config: BoardSettings) -> str:
     Raises:
         DeviceError: no program listens at the socket.
     """
-    make_board(config).close()
-    return "a person" if socket_address(config.presenter) is None else f"a program at {config.presenter}"
+    board = make_board(config)
+    if isinstance(board, PersonBoard):
+        return "a person"
+    with contextlib.closing(board):
+        board.connect()
+    return f"a program at {config.presenter}"
 
 
 class PersonBoard:
@@ -96,6 +97,8 @@ class PersonBoard:
 class SocketBoard:
     """A program at a socket that holds the board: a robot, or an emulated rig.
 
+    The first request connects to it, because only a calibration needs it.
+
     Raises:
         DeviceError: no program listens there, it is gone, or a pose is not possible.
     """
@@ -103,15 +106,21 @@ class SocketBoard:
     patience = 0.0
 
     def __init__(self, host: str, port: int) -> None:
-        self._name = f"socket://{host}:{port}"
-        try:
-            self._socket = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
-        except OSError as error:
-            raise DeviceError(
-                f"hardware.board.presenter: no program holds a board at {self._name}: {error.strerror or error}"
-            ) from None
-        self._socket.settimeout(ANSWER_TIMEOUT)
-        self._lines = self._socket.makefile("rb")
+        self._address, self._name = (host, port), f"socket://{host}:{port}"
+        self._opened: tuple[socket.socket, BinaryIO] | None = None
+
+    def connect(self) -> tuple[socket.socket, BinaryIO]:
+        """Connect to the program, if that is not done yet; give the connection and what reads its lines."""
+        if self._opened is None:
+            try:
+                connection = socket.create_connection(self._address, timeout=CONNECT_TIMEOUT)
+            except OSError as error:
+                raise DeviceError(
+                    f"hardware.board.presenter: no program holds a board at {self._name}: {error.strerror or error}"
+                ) from None
+            connection.settimeout(ANSWER_TIMEOUT)
+            self._opened = connection, connection.makefile("rb")
+        return self._opened
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
         """Request the board at a pose, or no board, and wait until that is done."""
@@ -123,14 +132,15 @@ class SocketBoard:
 
     def close(self) -> None:
         """Close the connection."""
-        self._lines.close()
-        self._socket.close()
+        for each in self._opened or ():
+            each.close()
 
     def _ask(self, what: str, T_fixed_board: RigidTransform | None) -> None:
         request = None if T_fixed_board is None else pose_dict(T_fixed_board)
+        connection, lines = self.connect()
         try:
-            self._socket.sendall(json.dumps({what: request}).encode() + b"\n")
-            line = self._lines.readline(LONGEST_ANSWER)
+            connection.sendall(json.dumps({what: request}).encode() + b"\n")
+            line = lines.readline(LONGEST_ANSWER)
         except OSError as error:
             raise DeviceError(f"{self._name}: the board's holder does not answer: {error}") from None
         try:
