@@ -156,6 +156,13 @@ def test_who_walks_changes_its_height_less_than_its_place():
         assert down @ of @ ahead == pytest.approx(0.0, abs=1e-9)
 
 
+def test_who_runs_accelerates_more_than_who_stands():
+    """A velocity over the time of a turn, 6 m/s over 2 s, is a part of the deviation: 1 + 3^2 times the variance."""
+    motion = MotionSettings(1.0, 0.5, 1e6, 0.04, turn_s=2.0)
+    standing, running = (propagate(state(velocity=v), ZERO, 0.5, motion)[1] for v in ([0.0] * 3, [6.0, 0.0, 0.0]))
+    assert running[6, 6] == pytest.approx(10 * standing[6, 6])
+
+
 def test_noise_along_the_axis_moves_a_target_off_the_axis_in_the_image():
     """a = X / Z, b = Y / Z and l = log Z change by (dX - a dZ) / Z, (dY - b dZ) / Z and dZ / Z."""
     a, b, Z = 0.5, -0.25, 8.0
