@@ -395,6 +395,24 @@ def test_birds_that_fly_apart_before_a_plain_sky_are_no_cut():
         assert not camera.jumped
 
 
+def test_a_flock_before_a_plain_sky_does_not_make_the_scene_jump():
+    """A part of it flies alike from one image to the next, and not for half a second."""
+    rng = np.random.default_rng(18)
+    birds = [120 + 60 * cv2.GaussianBlur(rng.normal(0, 1, (12, 12, 3)), (0, 0), 1.0) for _ in range(14)]
+    starts = rng.uniform((20, 20), (WIDTH - 32, HEIGHT - 32), (14, 2))
+    angles, speeds = rng.uniform(0, 1.2, 14), rng.uniform(2.0, 5.0, 14)
+    ways = speeds[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    camera, before = CameraMotion(), np.zeros(2)
+    for i in range(30):
+        picture = np.full((HEIGHT, WIDTH, 3), 170.0)
+        for bird, start, way in zip(birds, starts, ways, strict=True):
+            u, v = np.rint((start + i * way) % (WIDTH - 12, HEIGHT - 12)).astype(int).tolist()
+            picture[v : v + 12, u : u + 12] = bird
+        shift = camera.update(cv2.cvtColor(photograph(np.clip(picture, 0, 255), rng), cv2.COLOR_BGR2GRAY), i / RATE)
+        assert np.abs(shift - before).max() < 5.0  # no bird flies farther in a frame
+        before = shift
+
+
 def test_black_bars_beside_a_picture_do_not_make_a_target_of_it():
     rng = np.random.default_rng(17)
     pictures = []

@@ -24,8 +24,9 @@ FEWEST = 8
 SPREAD = 0.144
 # Fewest corners, where there were too few before, that show another scene.
 MANY = 24
-# If less than this part of the corners is found again, or of these at one shift, the film was cut or the camera was
-# moved. Standing corners count as the scene's from this part on.
+# If less than this part of the corners is found again, or of these at one shift, since the last image and since they
+# were detected, the film was cut, the camera was moved or the corners are on a flock. Standing corners count as the
+# scene's from this part on.
 FEWEST_ALIKE = 0.35
 # A film goes on while half of the corners look as before, to this mean difference of their surroundings [grey levels],
 # wherever they have gone: before a plain sky all are on birds. Or while so many stand: a car that fills the image is
@@ -105,15 +106,16 @@ class CameraMotion:
             _spread(self._corners[standing], before) > _spread(self._corners[alike], before)
         ):
             alike = standing
-        if kept.mean() < FEWEST_ALIKE or alike.sum() < fewest:
+        way = (ahead - self._first).reshape(-1, 2)  # since the corners were detected
+        shift = np.array([_shorth(way[alike, axis]) for axis in (0, 1)]) if alike.any() else np.zeros(2)
+        if kept.mean() < FEWEST_ALIKE or (alike & _alike(way, shift)).sum() < fewest:
             look = int(np.count_nonzero(kept & (error.ravel() < SAME_LOOK)))
             stand = int(np.count_nonzero(kept & _alike(flow, np.zeros(2))))
             self.jumped = 2 * look < len(kept) and stand < FEWEST_STANDING
             self._begun_t = -math.inf
             return
-        way = (ahead - self._first).reshape(-1, 2)[alike]
         self._corners, self._first = ahead[kept], self._first[kept]
-        self._shift = self._before + SCALE * np.array([_shorth(way[:, axis]) for axis in (0, 1)])
+        self._shift = self._before + SCALE * shift
 
     def _begin(self, corners: npt.NDArray[np.float32]) -> None:
         """Measure the shift by these corners, from the image on that they were detected in."""
