@@ -35,7 +35,11 @@ Expected = Mapping[int, tuple[Array, Array]]
 
 
 class Tracker:
-    """Turn each frame's detections into tracks with ids that are never reused."""
+    """Turn each frame's detections into tracks with ids that are never reused.
+
+    Attributes:
+        tracks: all tracks after the last update; confirmed ones first, then by age.
+    """
 
     def __init__(self, settings: TrackingSettings | None = None, image_size: tuple[int, int] | None = None) -> None:
         """Create a tracker without tracks.
@@ -49,15 +53,11 @@ class Tracker:
         self._settings = settings if image_size is None else settings.scaled(image_size[0])
         self._image_size = image_size
         self._tracks: list[LiveTrack] = []
+        self.tracks: list[Track] = []
         self._next_id = 1
         self._t: float | None = None
         self._shift: Array = np.zeros(2)  # of the scene in the last frame [px]
         self._interval = self._settings.lose_s  # between the last two frames [s]
-
-    @property
-    def tracks(self) -> list[Track]:
-        """All tracks after the last update; confirmed ones first, then by age."""
-        return sorted((s.track() for s in self._tracks), key=lambda track: (not track.confirmed, track.id))
 
     def update(
         self,
@@ -109,6 +109,8 @@ class Tracker:
         self._tracks = [s for s in self._tracks if not s.is_over(self._image_size)]
         least = self._settings.start_score
         self._start_tracks([each for j, each in enumerate(detections) if j not in taken and each.score >= least], t)
+        states = (state.track() for state in self._tracks)
+        self.tracks = sorted(states, key=lambda track: (not track.confirmed, track.id))
         return self.tracks
 
     def _begin(self, t: float, expected: Expected) -> None:
