@@ -29,9 +29,6 @@ from cotarget.rig import Detection, Frame, Image
 # In parts of the image's width: most that a camera shakes, more is a pan; and shift at which the background is learnt
 # again, because too much of it is out of view.
 SHAKE_PART, VIEW_PART = 3 / 640, 0.1
-# Part of a large target that a small one covers if they are the same target, of a small one that is a part of a large
-# one, and of a small one that is much larger: less than this is covered.
-SAME = 0.5
 # Targets and tracks are alike if their larger sides differ by less than this factor. A small target that one follows
 # is no part of a large one whose area is larger by more than the square, but a bird before a cloud.
 SIDE_RATIO = 2.0
@@ -254,17 +251,17 @@ def fuse(
         same = [
             (each, plain)
             for each, plain in zip(small, outlined, strict=True)
-            if _covered(whole, each) > SAME and like(each) >= like(whole)
+            if _mostly_covered(whole, each) and like(each) >= like(whole)
         ]
-        if any(plain or _covered(each, whole) < SAME for each, plain in same):
+        if any(plain or not _mostly_covered(each, whole) for each, plain in same):
             continue
-        inside = [each for each, plain in zip(small, outlined, strict=True) if plain and _covered(each, whole) > SAME]
+        inside = [each for each, plain in zip(small, outlined, strict=True) if plain and _mostly_covered(each, whole)]
         if any(SIDE_RATIO**2 * each.size_px.prod() > whole.size_px.prod() for each in inside):
             continue  # the rest of it is the place that the target has left
         parts = [
             each
             for each, own in zip(small, followed, strict=True)
-            if (_covered(each, whole) > SAME or _covered(whole, each) > SAME)
+            if (_mostly_covered(each, whole) or _mostly_covered(whole, each))
             and not (own and SIDE_RATIO**2 * each.size_px.prod() < whole.size_px.prod())
         ]
         found = [each for each in found if not any(each is part for part in parts)]
@@ -298,7 +295,7 @@ def _within(found: Sequence[Detection], places: Sequence[tuple[Array, Array]]) -
     return np.asarray((np.abs(at - center) < size / 2).all(axis=2))
 
 
-def _covered(one: Detection, other: Detection) -> float:
-    """Part of one detection's box that another covers."""
+def _mostly_covered(one: Detection, other: Detection) -> bool:
+    """Whether another detection covers more than half of one's box."""
     shared = intersection_areas(one.center_px[None], one.size_px[None], other.center_px[None], other.size_px[None])
-    return float(shared[0, 0] / one.size_px.prod())
+    return bool(2 * shared[0, 0] > one.size_px.prod())

@@ -27,10 +27,10 @@ from cotarget.rig import Detection, Frame, Image
 
 # Images are halved until they are at most this wide [px]; the lengths below are in pixels of the result.
 WIDEST_PX = 480
-# The mixture: its memory, and the interval at which the background is learnt beside what is held and its image is read,
-# a third of a frame's work [s]; the part of a pixel's history that is its background; and the squared distance to it,
-# in variances, from which a pixel is foreground.
-HISTORY_S, UPDATE_S = 20.0, 0.2
+# The mixture: its memory [s]; the part of a pixel's history that is its background; and the squared distance to it, in
+# variances, from which a pixel is foreground. Beside what is held, the background is learnt and its image is read every
+# LASTING_S, because that is a third of a frame's work.
+HISTORY_S = 20.0
 BACKGROUND_PART, THRESHOLD = 0.7, 20.0
 # Foreground thinner than the first is removed, but not that within the second of what is left: feet and rotors. Gaps
 # (across, down) that are closed within a target: what stands side by side is not bridged [px].
@@ -45,8 +45,6 @@ SCORE = 0.3
 # Of an upright target, parts of a component that are thinner than the first part of its height lie on the ground, such
 # as the edge of a shadow, if it is wider than the second part. What is left is no wider than it is high.
 FLAT, WIDE = 0.1, 0.6
-# Half the width of a target's edge, on which a target is distinguished from the place that one has left [px].
-EDGE_PX = 1
 # Width of the edge from which it is that of a cloud [px], the part of foreground with less difference to the background
 # than counts, and the part of a box with less slope: the edge is as wide as that difference over that slope.
 SOFT_PX, CONTRAST_PART, SLOPE_PART = 4.0, 0.9, 0.98
@@ -140,7 +138,7 @@ class LargeTargetFinder:
         at_once = not held or not self._learnt
         mask = np.asarray(self._model.apply(image, learningRate=self._rate(t) if at_once else 0), dtype=np.uint8)
         lit = self._lit(mask, image, held)
-        if not at_once and (self._t is None or not 0 <= t - self._t < UPDATE_S):
+        if not at_once and (self._t is None or not 0 <= t - self._t < LASTING_S):
             kept = np.zeros(mask.shape, np.uint8)
             for box in held:
                 if not self._is_ghost(image, mask, box):
@@ -157,7 +155,7 @@ class LargeTargetFinder:
         box = _enlarged(box)
         if not mask[box].any():
             return False
-        nearby = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
+        nearby = np.ones((3, 3), np.uint8)
         edge = cv2.morphologyEx(mask[box], cv2.MORPH_GRADIENT, nearby)
         now, before = (
             sum(cv2.mean(cv2.morphologyEx(each[box], cv2.MORPH_GRADIENT, nearby), edge))
@@ -195,9 +193,9 @@ class LargeTargetFinder:
         return min(1.0, dt / min(HISTORY_S, 2 * self._learnt))
 
     def _background(self) -> Image:
-        """Background image, at most `UPDATE_S` old."""
+        """Background image, at most `LASTING_S` old."""
         learnt, known = self._learnt, self._known
-        if known is None or not UPDATE_S <= learnt <= known[1] + UPDATE_S:
+        if known is None or not LASTING_S <= learnt <= known[1] + LASTING_S:
             known = self._known = self._model.getBackgroundImage(), learnt
         return known[0]
 
@@ -275,8 +273,8 @@ def _rows_and_columns(box: Detection) -> tuple[slice, slice]:
 
 
 def _enlarged(box: tuple[slice, slice]) -> tuple[slice, slice]:
-    """Enlarge a part of an image by EDGE_PX to each side, up to the image's border."""
-    rows, columns = (slice(max(0, each.start - EDGE_PX), each.stop + EDGE_PX) for each in box)
+    """Enlarge a part of an image by a pixel to each side, up to the image's border."""
+    rows, columns = (slice(max(0, each.start - 1), each.stop + 1) for each in box)
     return rows, columns
 
 

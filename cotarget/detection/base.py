@@ -32,6 +32,8 @@ MOST_FOREGROUND = 0.45
 QUIET_PART = 0.5 / 640
 # Time for which a picture must be another, or a camera must stand, before it counts: a flash is shorter [s].
 LASTING_S = 0.2
+# Time for which a scene stays the same but for what moves: corners are kept and exposures averaged over it [s].
+SAME_S = 0.5
 
 
 @dataclass(frozen=True)

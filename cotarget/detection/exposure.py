@@ -17,9 +17,9 @@ CELLS = (32, 24)
 OTHER_PICTURE = 0.15
 # Least change that is one of the exposure.
 DARKEST = 1 / 3
-# Images are compared if their exposures differ by at most this part, because a codec draws texture again; time over
-# which exposures are averaged for it, so that a lamp may flicker and a cloud pass [s].
-SAME_EXPOSURE, AVERAGED_S = 0.02, 0.5
+# Images are compared if their exposures differ by at most this part, because a codec draws texture again. They
+# are averaged over SAME_S for it, so that a lamp may flicker and a cloud pass.
+SAME_EXPOSURE = 0.02
 
 
 class Exposure:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from cotarget.detection.base import SAME_S
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
@@ -16,12 +17,11 @@ CORNER_CELLS = (16, 12)
 # Least eigenvalue of a corner, of cv2.cornerMinEigenVal: noise of 5 grey levels reaches it. In an image of sky
 # alone, the strongest corners are the target and artefacts of the codec.
 LEAST_CORNER = 3e-4
-CORNER_BLOCK = 3
 # Fewer corners are no measurement, and the camera is taken to stand still.
 FEWEST = 8
 # Least standard deviation of the corners' places along one axis, over the image's side. Corners nearer together are on
-# a target before a plain background, and the camera is taken to stand still. All over half an image they have 0.144.
-SPREAD = 0.144
+# a target before a plain background, and the camera is taken to stand still. It is that of half an image.
+SPREAD = math.sqrt(1 / 48)
 # Fewest corners, where there were too few before, that show another scene.
 MANY = 24
 # If less than this part of the corners is found again, or of these at one shift, since the last image and since they
@@ -32,8 +32,6 @@ FEWEST_ALIKE = 0.35
 # wherever they have gone: before a plain sky all are on birds. Or while so many stand: a car that fills the image is
 # blurred. After a cut only those of writing do.
 SAME_LOOK, FEWEST_STANDING = 8.0, 5
-# Time after which corners are detected again, because some have drifted off and some are on a target [s].
-RENEW_S = 0.5
 # Window in which a corner is tracked, and pyramid levels: up to 20 px a frame of the full image.
 WINDOW_PX, LEVELS = (11, 11), 2
 # Largest difference of a corner's shift from the common one, along each axis [px].
@@ -83,7 +81,7 @@ class CameraMotion:
         pixel a frame, are then distinguished from the scene, and their drift does not add up.
         """
         self.jumped = False
-        if not 0 <= self._t - self._begun_t < RENEW_S:
+        if not 0 <= self._t - self._begun_t < SAME_S:  # some have drifted off, and some are on a target
             self._begin(_corners(before))
             self._begun_t = self._t
         if len(self._corners) < FEWEST or _spread(self._corners, before) < SPREAD:
@@ -125,7 +123,7 @@ class CameraMotion:
 
 def _corners(picture: Image) -> npt.NDArray[np.float32]:
     """Detect the strongest corner of each cell that is stronger than noise, (n, 1, 2)."""
-    strength = cv2.cornerMinEigenVal(picture, CORNER_BLOCK)
+    strength = cv2.cornerMinEigenVal(picture, blockSize=3)
     columns, rows = CORNER_CELLS
     height, width = -(-picture.shape[0] // rows), -(-picture.shape[1] // columns)  # of a cell
     below, beside = rows * height - picture.shape[0], columns * width - picture.shape[1]

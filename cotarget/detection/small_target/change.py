@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cotarget.detection.exposure import AVERAGED_S, OTHER_PICTURE, SAME_EXPOSURE
+from cotarget.detection.base import SAME_S
+from cotarget.detection.exposure import OTHER_PICTURE, SAME_EXPOSURE
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
@@ -23,8 +24,6 @@ SEARCH_PX, SEARCH_PART, MOST_SEARCH_PX = 1, 0.05, 4
 MARGIN_PX = 2
 # Least noise, from coding and quantisation, where nothing happens [grey levels].
 LEAST_NOISE = 1.0
-# Every how many pixels the noise is sampled, from the difference to the last frame.
-NOISE_STRIDE = 8
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class History:
         if self._kept and not 0 < t - self._kept[-1][0] <= (1 + AGE_TOLERANCE) * AGES_S[-1]:
             self._kept.clear()
         if self._last is not None:
-            a, b = (image[::NOISE_STRIDE, ::NOISE_STRIDE] for image in (self._last, grey))
+            a, b = (image[::8, ::8] for image in (self._last, grey))
             difference = cv2.absdiff(a, b)
             if not difference.any() and np.array_equal(self._last, grey):
                 return False
@@ -85,7 +84,7 @@ class History:
             self._kept.clear()
         self._last_exposure = exposure
         since = t - self._kept[-1][0] if self._kept else math.inf
-        self._exposure += (1 - math.exp(-since / AVERAGED_S)) * (exposure - self._exposure)
+        self._exposure += (1 - math.exp(-since / SAME_S)) * (exposure - self._exposure)
         self._kept.append((t, grey, shift, self._exposure))
         while (
             t - self._kept[0][0] > (1 + AGE_TOLERANCE) * AGES_S[-1]

@@ -20,8 +20,6 @@ GUARD_HALF_PX, OUTER_HALF_PX = 7, 11
 # Scales, for targets of up to 12 px to those of up to 50. Outlines are found in images that are at most as many scales
 # finer, which bounds the window's size.
 SCALES = 3
-# How far the largest ring reaches, and the side of a pixel of the image in which it is measured [px].
-REACH_PX, ALIGNED_PX = OUTER_HALF_PX * 2**SCALES, 2**SCALES
 # Most regions found, and most examined at each scale, the strongest first; bounds the computing time.
 MOST_TARGETS = 40
 # Least standard deviation of a ring [grey levels]: a codec smooths away a sky's noise, but not its steps.
@@ -33,8 +31,6 @@ SMALLEST_TIMES = 2.0
 BESIDE, BESIDE_PX = 2.0, 6.0
 # Part of the contrast at which a target's outline lies.
 OUTLINE = 0.33
-# Window of the mean that a pixel of the coarsest scale is compared with, which measures texture [px].
-TEXTURE_PX = (5, 5)
 
 
 class SmallTarget(NamedTuple):
@@ -100,7 +96,7 @@ def find_small_targets(
                 break
     if of_difference or coarsest not in scales:  # a small image is not searched at all scales
         return kept
-    texture = cv2.absdiff(levels[coarsest], cv2.blur(levels[coarsest], TEXTURE_PX))
+    texture = cv2.absdiff(levels[coarsest], cv2.blur(levels[coarsest], (5, 5)))
     return [target._replace(beside=_beside(texture, target, 2**coarsest)) for target in kept]
 
 

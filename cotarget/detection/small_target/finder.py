@@ -12,10 +12,9 @@ from cotarget.detection.base import QUIET_PART, Detections, halvings, moved
 from cotarget.detection.small_target.camera_motion import CameraMotion
 from cotarget.detection.small_target.change import AGES_S, History, Reference, changes
 from cotarget.detection.small_target.contrast import (
-    ALIGNED_PX,
     INNER_PX,
     LEAST_ROUGHNESS,
-    REACH_PX,
+    OUTER_HALF_PX,
     SCALES,
     SmallTarget,
     find_small_targets,
@@ -55,9 +54,9 @@ WIDEST_PX, MOST_TIMES = 960, 4
 # Least contrast in an image that was doubled twice and has more noise than LEAST_ROUGHNESS: its finest scale lies
 # within one pixel of the camera, so the mean does not reduce the noise.
 NOISY_SIGNAL = 5.5
-# Least span of the history before anything is detected: at first, when it has an image of the shortest age; and after a
-# cut, whose new scene must be seen for a while [s].
-WARM_UP_S, AFTER_CUT_S = 0.09, AGES_S[1]
+# Least span of the history before anything is detected [s]: it has an image of the shortest age. After a cut it is the
+# second age, because the new scene must be seen for a while.
+WARM_UP_S = 0.09
 
 Found = tuple[SmallTarget, Detection]  # a region and its box
 
@@ -95,7 +94,7 @@ class SmallTargetFinder:
         shift = times * shift
         if self.camera.jumped:
             self._history.clear()
-            self._warm_up_s = AFTER_CUT_S
+            self._warm_up_s = AGES_S[1]
         references = self._history.references(frame.t, shift)
         self.repeated = not self._history.add(frame.t, grey, shift, exposure)
         if self.repeated or self._history.span < self._warm_up_s:
@@ -168,8 +167,10 @@ class SmallTargetFinder:
         left, top, width, height = cv2.boundingRect(there)
         if not width:
             return []
-        left, top, right, bottom = (left - REACH_PX, top - REACH_PX, left + width + REACH_PX, top + height + REACH_PX)
-        left, top = max(0, left) // ALIGNED_PX * ALIGNED_PX, max(0, top) // ALIGNED_PX * ALIGNED_PX
+        side = 2**SCALES  # of a pixel of the image in which the largest ring is measured
+        reach = side * OUTER_HALF_PX
+        left, top, right, bottom = left - reach, top - reach, left + width + reach, top + height + reach
+        left, top = max(0, left) // side * side, max(0, top) // side * side
         found = []
         for target in find_small_targets([unusual[top:bottom, left:right]], LEAST_DIFFERENCE, of_difference=True):
             score = float(1 / (1 + (EVEN_DIFFERENCE / target.signal) ** self._weights[0]))
