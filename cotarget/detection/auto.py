@@ -88,7 +88,8 @@ class AutoDetector:
         self._size.check(frame.image)
         width = frame.image.shape[1]
         images = halvings(frame.image, WIDEST_PX)
-        exposure = self._exposure.measure(images[-1], frame.t)
+        # On the last but one, which is 480 to 960 px wide; the whole image takes up to a quarter of the detection.
+        exposure = self._exposure.measure(images[max(len(images) - 2, 0)], frame.t)
         self._hold(held, width)
         targets, contrast = self._small_finder.find(frame, exposure)
         shift_px = self._register(frame.t, width)

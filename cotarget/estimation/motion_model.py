@@ -48,7 +48,7 @@ class MotionSettings:
     """Motion of a target, and of the slow unknowns: size, attitude and the head's bias.
 
     Attributes:
-        acceleration: standard deviation of the acceleration along each axis, of a target that stands [m/s^2].
+        acceleration: standard deviation of the acceleration along each axis, of a target at its usual speed [m/s^2].
         manoeuvre_s: time constant of the acceleration [s]. Much less than a frame's time makes the velocity a
             random walk; much more makes the acceleration constant, or each turn a circle.
         speed: standard deviation of the velocity along each axis [m/s].
@@ -60,7 +60,8 @@ class MotionSettings:
         bias_s: time constant of that bias [s].
         nearest: least depth of a target, along the fixed camera's axis [m].
         turns: whether the acceleration turns with the velocity, as in a coordinated turn.
-        turn_s: time in which a target may turn or stop; its velocity over it is a part of that deviation [s].
+        turn_m: radius of a turn; the centripetal acceleration on it, less that of twice the usual speed, is a part of
+            that deviation [m].
         slope: acceleration and velocity along the pan axis over those across it: of what walks on the ground, the slope
             of the ground.
         pan_axis: direction of the pan axis in the fixed camera's frame; None if it is not known, and all directions are
@@ -78,7 +79,7 @@ class MotionSettings:
     bias_s: float = 60.0
     nearest: float = 0.1
     turns: bool = False
-    turn_s: float = math.inf
+    turn_m: float = math.inf
     slope: float = 1.0
     pan_axis: tuple[float, float, float] | None = None
 
@@ -147,7 +148,7 @@ class FilterSettings:
 # Of a target of which nothing is known, motion and attitude lie between a walking and a flying one's.
 MOTIONS = {
     "standing": MotionSettings(0.8, 0.3, 1.5, 0.01, attitude_sigma=0.01, attitude_s=2.0),
-    "walking": MotionSettings(1.0, 0.5, 1.2, 0.04, turn_s=2.0, slope=0.2),
+    "walking": MotionSettings(1.0, 0.5, 1.2, 0.04, turn_m=8.0, slope=0.2),
     "flying": MotionSettings(6.5, 5.0, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0, turns=True),
     "general": MotionSettings(2.5, 1.0, 3.0, 0.075, attitude_sigma=0.2, attitude_s=1.0),
 }
@@ -338,7 +339,8 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale
     N[:, LOG_DEPTH] -= y[MOVING]
     N[LOG_DEPTH, LOG_DEPTH] = 1.0
     # The mean of 1 / depth^2 over the depth's distribution: an uncertain depth makes the noise larger.
-    turning = math.exp(x[LOG_DEPTH]) * float(np.linalg.norm(x[VELOCITY])) / motion.turn_s
+    squared = math.exp(2 * x[LOG_DEPTH]) * float(x[VELOCITY] @ x[VELOCITY])  # of the speed
+    turning = max(squared - (2 * motion.speed) ** 2, 0.0) / motion.turn_m
     widened = math.exp(min(P[LOG_DEPTH, LOG_DEPTH], MOST_UNCERTAINTY) - log_depth)
     sigma = math.hypot(motion.acceleration, turning) * widened
     P[MOVING, MOVING] += N @ noise @ N.T * (noise_scale * sigma * sigma)

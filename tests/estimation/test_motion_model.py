@@ -156,11 +156,12 @@ def test_who_walks_changes_its_height_less_than_its_place():
         assert down @ of @ ahead == pytest.approx(0.0, abs=1e-9)
 
 
-def test_who_runs_accelerates_more_than_who_stands():
-    """A velocity over the time of a turn, 6 m/s over 2 s, is a part of the deviation: 1 + 3^2 times the variance."""
-    motion = MotionSettings(1.0, 0.5, 1e6, 0.04, turn_s=2.0)
-    standing, running = (propagate(state(velocity=v), ZERO, 0.5, motion)[1] for v in ([0.0] * 3, [6.0, 0.0, 0.0]))
-    assert running[6, 6] == pytest.approx(10 * standing[6, 6])
+@pytest.mark.parametrize(("speed", "deviation"), [(0.0, 1.0), (2.0, 1.0), (6.0, math.hypot(1.0, (36 - 4) / 8))])
+def test_who_runs_turns_and_brakes_harder(speed, deviation):
+    """The centripetal acceleration on a circle of 8 m, less that of 2 m/s, is a part of the deviation."""
+    motion = MotionSettings(1.0, 0.5, 1.0, 0.04, turn_m=8.0)
+    P = propagate(state(velocity=[speed, 0.0, 0.0]), ZERO, 0.5, motion)[1]
+    assert P[6, 6] == pytest.approx(deviation**2 * -math.expm1(-2 * 0.5 / 0.5))
 
 
 def test_noise_along_the_axis_moves_a_target_off_the_axis_in_the_image():

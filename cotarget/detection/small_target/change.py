@@ -24,6 +24,8 @@ SEARCH_PX, SEARCH_PART, MOST_SEARCH_PX = 1, 0.05, 4
 MARGIN_PX = 2
 # Least noise, from coding and quantisation, where nothing happens [grey levels].
 LEAST_NOISE = 1.0
+# Every how many pixels the noise is sampled, from the difference to the last frame.
+NOISE_STRIDE = 8
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class History:
         if self._kept and not 0 < t - self._kept[-1][0] <= (1 + AGE_TOLERANCE) * AGES_S[-1]:
             self._kept.clear()
         if self._last is not None:
-            a, b = (image[::8, ::8] for image in (self._last, grey))
+            a, b = (image[::NOISE_STRIDE, ::NOISE_STRIDE] for image in (self._last, grey))
             difference = cv2.absdiff(a, b)
             if not difference.any() and np.array_equal(self._last, grey):
                 return False

@@ -3,6 +3,7 @@
 This is a constant false alarm rate detector (Rohling 1983) in two dimensions.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -31,6 +32,8 @@ SMALLEST_TIMES = 2.0
 BESIDE, BESIDE_PX = 2.0, 6.0
 # Part of the contrast at which a target's outline lies.
 OUTLINE = 0.33
+# Window of the mean that a pixel of the coarsest scale is compared with, which measures texture [px].
+TEXTURE_PX = (5, 5)
 
 
 class SmallTarget(NamedTuple):
@@ -96,7 +99,7 @@ def find_small_targets(
                 break
     if of_difference or coarsest not in scales:  # a small image is not searched at all scales
         return kept
-    texture = cv2.absdiff(levels[coarsest], cv2.blur(levels[coarsest], (5, 5)))
+    texture = cv2.absdiff(levels[coarsest], cv2.blur(levels[coarsest], TEXTURE_PX))
     return [target._replace(beside=_beside(texture, target, 2**coarsest)) for target in kept]
 
 
@@ -141,13 +144,9 @@ def _peaks(levels: Sequence[Image], scale: int, threshold: float, finest: bool, 
     level, (mean, deviation) = levels[scale], _ring(levels[scale + 1])
     width, height = size = level.shape[1], level.shape[0]
     blurred = cv2.blur(level, (INNER_PX,) * 2)
-    # In bytes, which is three times as fast; half a grey level is little beside the threshold.
-    ground = cv2.resize(cv2.convertScaleAbs(mean), size)
-    margin = cv2.resize(cv2.convertScaleAbs(deviation, alpha=threshold), size)
     searched = [(blurred, blurred, deviation)]  # darkest and brightest around each pixel, roughness of the surroundings
-    # By how much each pixel stands out beyond the threshold.
-    off = cv2.subtract(cv2.subtract(blurred, ground) if of_difference else cv2.absdiff(blurred, ground), margin)
     if finest and not of_difference:
+        rougher = deviation * np.float32(SMALLEST_TIMES) - np.float32((SMALLEST_TIMES - 1) * LEAST_ROUGHNESS)
         if scale:
             finer, pair = cv2.blur(levels[scale - 1], (INNER_PX,) * 2), np.ones((2, 2), np.uint8)
             dark, bright = (
@@ -156,11 +155,15 @@ def _peaks(levels: Sequence[Image], scale: int, threshold: float, finest: bool, 
         else:
             # Linear interpolation halfway between pixels is the mean of 2x2 px, at a third of blur's time.
             dark = bright = cv2.getRectSubPix(level, size, (width / 2 - 1, height / 2 - 1))
-        more = (SMALLEST_TIMES - 1) * LEAST_ROUGHNESS
-        searched.append((dark, bright, deviation * np.float32(SMALLEST_TIMES) - np.float32(more)))
-        rougher = cv2.convertScaleAbs(margin, alpha=SMALLEST_TIMES, beta=-more * threshold)
-        contrast = cv2.max(cv2.subtract(bright, ground), cv2.subtract(ground, dark))
-        off = cv2.max(off, cv2.subtract(contrast, rougher))
+        searched.append((dark, bright, rougher))
+    beyond = []  # by how much each pixel stands out beyond the threshold
+    for dark, bright, roughness in searched:
+        # In bytes, which is three times as fast; half a grey level is little beside the threshold.
+        margin = roughness * np.float32(threshold)
+        beyond.append(cv2.subtract(bright, cv2.resize(cv2.add(mean, margin, dtype=cv2.CV_8U), size)))
+        if not of_difference:
+            beyond.append(cv2.subtract(cv2.resize(cv2.subtract(mean, margin, dtype=cv2.CV_8U), size), dark))
+    off = functools.reduce(cv2.max, beyond)
     peaks = []
     for contour in cv2.findContours(cv2.compare(off, 0, cv2.CMP_GT), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
         x, y, w, h = cv2.boundingRect(contour)
