@@ -54,9 +54,9 @@ WIDEST_PX, MOST_TIMES = 960, 4
 # Least contrast in an image that was doubled twice and has more noise than LEAST_ROUGHNESS: its finest scale lies
 # within one pixel of the camera, so the mean does not reduce the noise.
 NOISY_SIGNAL = 5.5
-# Least span of the history before anything is detected [s]: it has an image of the shortest age. After a cut it is the
-# second age, because the new scene must be seen for a while.
-WARM_UP_S = 0.09
+# Least span of the history before anything is detected: at first, when it has an image of the shortest age; and after a
+# cut, whose new scene must be seen for a while [s].
+WARM_UP_S, AFTER_CUT_S = 0.09, AGES_S[1]
 
 Found = tuple[SmallTarget, Detection]  # a region and its box
 
@@ -94,7 +94,7 @@ class SmallTargetFinder:
         shift = times * shift
         if self.camera.jumped:
             self._history.clear()
-            self._warm_up_s = AGES_S[1]
+            self._warm_up_s = AFTER_CUT_S
         references = self._history.references(frame.t, shift)
         self.repeated = not self._history.add(frame.t, grey, shift, exposure)
         if self.repeated or self._history.span < self._warm_up_s:
